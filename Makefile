@@ -1,0 +1,72 @@
+# Everything runs inside .venv, which the targets below make and keep up to date.
+#
+# Variables: PYTHON (interpreter for the environment), SEED and DEMO_DIR (make demo),
+# PYTEST_ARGS (make test), BENCH_ARGS (make bench).
+
+SHELL := /bin/bash
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+SEED ?= 0
+DEMO_DIR ?= runs/demo
+PYTEST_ARGS ?= -n auto
+BENCH_ARGS ?=
+
+export MPLBACKEND ?= Agg
+export PIP_DISABLE_PIP_VERSION_CHECK ?= 1
+
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.DELETE_ON_ERROR:
+.PHONY: help demo test lint format docs bench wheel lock clean
+
+help: ## Show this list
+	@awk 'BEGIN {FS = ":.*## "} /^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' Makefile
+
+demo: $(VENV)/.installed-base ## Train METRPO on the pendulum, then plot returns against actuator bias
+	$(BIN)/torchrl-l1 run metrpo/inverted_pendulum seed=$(SEED) run_dir=$(DEMO_DIR) --resume
+	$(BIN)/torchrl-l1 evaluate $(DEMO_DIR) --l1 off paper --bias 0 0.5 1 1.5 --filmstrip
+
+test: $(VENV)/.installed-test ## Run the tests and the examples in the docstrings
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: $(VENV)/.installed-lint ## ruff (rules and format) and mypy
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/.installed-lint ## Rewrite the sources as ruff formats them
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+docs: $(VENV)/.installed-docs ## Build the documentation, warnings are errors
+	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+	@echo "open docs/_build/html/index.html"
+
+bench: $(VENV)/.installed-bench ## Run all speed tables (about ten quiet minutes)
+	$(BIN)/python -m benchmarks $(BENCH_ARGS)
+
+wheel: $(VENV)/.installed-base ## Build the wheel into dist/ and check what is in it
+	rm -rf dist
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+	$(BIN)/python .ci/check_wheel.py dist/*.whl
+
+lock: ## Resolve constraints.txt anew (needs a quiet quarter of an hour)
+	.ci/lock $(PYTHON)
+
+clean: ## Remove the environment and everything built
+	rm -rf $(VENV) build dist docs/_build docs/_generated
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -not -path './.git/*' -prune -exec rm -rf {} +
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || { \
+	    echo "error: torchrl_l1 needs Python 3.11 to 3.13, but '$(PYTHON)' is" \
+	        "$$($(PYTHON) --version 2>&1 || true). Try: make PYTHON=python3.11 <target>" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+# One stamp for each set of extras: a second call installs nothing.
+$(VENV)/.installed-%: pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/python -m pip install --quiet -c constraints.txt \
+	    -e '.$(if $(filter base,$*),,[$*])'
+	@touch $@

@@ -1,0 +1,67 @@
+"""``python -m benchmarks [NAME ...]``: run the tables, print them and write them to files."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from benchmarks import collection, env_stepping, jacobian
+from benchmarks.tables import Table
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def _stepping(repetitions: int) -> Table:
+    return Table(
+        "env_stepping",
+        "Environment stepping",
+        "Environment steps per second, median (range): the batched environment and "
+        "`SerialEnv(GymEnv)`, one thread.",
+        env_stepping.run(repetitions),
+        {
+            "task": "task",
+            "num_envs": "environments",
+            "batched": "batched",
+            "serial": "SerialEnv",
+            "ratio": "ratio",
+        },
+        {"batched": ",.0f", "serial": ",.0f", "ratio": ".1f"},
+    )
+
+
+# Name: (threads, default repetitions, measurement).
+BENCHMARKS: dict[str, tuple[int, int, Callable[[int], Table]]] = {
+    "jacobian": (jacobian.THREADS, 21, jacobian.table),
+    "env_stepping": (1, 9, _stepping),
+    "collection": (collection.THREADS, 15, collection.table),
+}
+
+
+def main() -> None:
+    """Run what the command line names, all by default."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS))
+    parser.add_argument("--repetitions", type=int, help="measurements of each case")
+    parser.add_argument("--threads", type=int, help="threads of torch, for all tables")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="folder for the files")
+    arguments = parser.parse_args()
+    if unknown := set(arguments.names) - set(BENCHMARKS):
+        parser.error(f"no benchmark {sorted(unknown)}; there are {', '.join(BENCHMARKS)}")
+    if arguments.repetitions is not None and arguments.repetitions < 1:
+        parser.error(f"--repetitions must be at least 1, got {arguments.repetitions}")
+    for name in arguments.names or BENCHMARKS:
+        threads, repetitions, measure = BENCHMARKS[name]
+        torch.set_num_threads(arguments.threads or threads)
+        table = measure(arguments.repetitions or repetitions)
+        table.write(arguments.output)
+        print(table.markdown(), flush=True)
+    pages = [arguments.output / f"{name}.md" for name in BENCHMARKS]
+    summary = "\n".join(page.read_text() for page in pages if page.exists())
+    (arguments.output / "summary.md").write_text(summary)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,83 @@
+"""Tables of measurements as Markdown and CSV."""
+
+from __future__ import annotations
+
+import csv
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from benchmarks.timing import Row
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of a benchmark and how to show them.
+
+    Attributes:
+        name: stem of the files.
+        title: heading.
+        caption: what is measured, with its unit.
+        rows: measurements; a column ``x`` may come with ``x_low`` and ``x_high``.
+        columns: columns to show, with their headings; ``rows`` may hold more.
+        formats: format specification by column, ``.2f`` unless given.
+    """
+
+    name: str
+    title: str
+    caption: str
+    rows: Sequence[Row]
+    columns: Mapping[str, str]
+    formats: Mapping[str, str]
+
+    def markdown(self) -> str:
+        """The table with its heading, each cell as median and range."""
+        lines = [
+            f"### {self.title}",
+            "",
+            self.caption,
+            "",
+            f"| {' | '.join(self.columns.values())} |",
+            "|" + "---|" * len(self.columns),
+        ]
+        for row in self.rows:
+            lines.append(f"| {' | '.join(self._cell(row, column) for column in self.columns)} |")
+        return "\n".join([*lines, ""])
+
+    def _cell(self, row: Row, column: str) -> str:
+        value, form = row[column], self.formats.get(column, ".2f")
+        if isinstance(value, str | int):
+            return str(value)
+        if f"{column}_low" not in row:
+            return f"{value:{form}}"
+        return f"{value:{form}} ({row[f'{column}_low']:{form}} to {row[f'{column}_high']:{form}})"
+
+    def write(self, folder: Path) -> None:
+        """Write ``name.md`` and ``name.csv``."""
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{self.name}.md").write_text(f"{self.markdown()}\n*{machine()}*\n")
+        with (folder / f"{self.name}.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(self.rows[0]))
+            writer.writeheader()
+            writer.writerows(self.rows)
+
+
+def machine() -> str:
+    """Processor, threads and versions, in a line."""
+    return (
+        f"{_processor()}, {os.cpu_count()} cores, {torch.get_num_threads()} threads in use; "
+        f"Python {platform.python_version()}, torch {torch.__version__}"
+    )
+
+
+def _processor() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()

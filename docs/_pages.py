@@ -1,0 +1,59 @@
+"""Pages made from the package itself, so that they cannot fall behind it."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from pathlib import Path
+from typing import Any
+
+PACKAGES = ("control", "dynamics", "envs", "objectives", "algorithms", "experiment")
+
+
+def metrics_table() -> str:
+    """Every metric that METRPO logs, as a Markdown table."""
+    from torchrl_l1.algorithms.metrpo import METRICS
+
+    rows = [f"| `{name}` | {meaning} |" for name, meaning in METRICS.items()]
+    return "\n".join(["| Metric | Meaning |", "|---|---|", *rows, ""])
+
+
+def api_page(package: str) -> str:
+    """An ``automodule`` section for each module of a sub-package, in alphabetical order."""
+    name = f"torchrl_l1.{package}"
+    modules = pkgutil.iter_modules(importlib.import_module(name).__path__)
+    sections = [_section(f"{name}.{module.name}") for module in modules if module.name[0] != "_"]
+    return "\n".join(sections)
+
+
+def _section(module: str) -> str:
+    directive = (
+        f".. automodule:: {module}\n   :members:\n   :ignore-module-all:\n   :show-inheritance:"
+    )
+    return f"## {module}\n\n```{{eval-rst}}\n{directive}\n```\n"
+
+
+def resolve_public_name(app: Any, env: Any, node: Any, contnode: Any) -> Any:
+    """Link ``package.Name`` to ``package.module.Name``, under which the name is documented."""
+    package, _, name = node.get("reftarget", "").rpartition(".")
+    domain = env.get_domain("py")
+    depth = package.count(".") + 2
+    found = [
+        full
+        for full in domain.objects
+        if full.startswith(f"{package}.") and full.endswith(f".{name}") and full.count(".") == depth
+    ]
+    if node.get("refdomain") != "py" or not package or len(found) != 1:
+        return None
+    where = node.get("refdoc", env.docname)
+    return domain.resolve_xref(env, where, app.builder, "obj", found[0], node, contnode)
+
+
+def write(folder: Path) -> None:
+    """Write all generated pages; files that would not change are left alone."""
+    pages = {"metrics": metrics_table()} | {f"api_{name}": api_page(name) for name in PACKAGES}
+    folder.mkdir(exist_ok=True)
+    for name, text in pages.items():
+        path = folder / f"{name}.md"
+        if not path.exists() or path.read_text() != text:
+            path.write_text(text)

@@ -1,0 +1,122 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchrl_l1.algorithms import METRPO, METRPOConfig, Perturbation
+from torchrl_l1.algorithms.metrpo import METRICS, ModelConfig, PolicyConfig
+from torchrl_l1.control import L1Config
+from torchrl_l1.dynamics import FitConfig
+from torchrl_l1.objectives import TRPOConfig
+
+L1 = L1Config(0.04, epsilon=0.2, action_low=-3.0, action_high=3.0)
+
+
+def tiny(**changes: object) -> METRPOConfig:
+    settings = {
+        "outer_iterations": 2,
+        "episodes_per_iteration": 3,
+        "trpo_iterations": 2,
+        "imagined_steps": 200,
+        "imagined_horizon": 20,
+        "label": "executed",
+        "model": ModelConfig(members=2, hidden=[16]),
+        "policy": PolicyConfig(hidden=[8]),
+        "fit": FitConfig(batch_size=32, max_epochs=3),
+        "trpo": TRPOConfig(fisher_fraction=1.0),
+    }
+    return METRPOConfig(**{**settings, **changes})  # type: ignore[arg-type]
+
+
+def make(l1: L1Config | None = L1, seed: int = 0, **changes: object) -> METRPO:
+    return METRPO("inverted_pendulum", tiny(**changes), l1=l1, seed=seed, horizon=25)
+
+
+def test_every_metric_is_documented_and_finite() -> None:
+    results = [result.metrics for result in make().iterate()]
+    assert set(results[0]) == set(METRICS)
+    assert all(math.isfinite(value) for metrics in results for value in metrics.values())
+    assert [metrics["iteration"] for metrics in results] == [0, 1]
+    # 3 episodes of 25 random steps, then as many per iteration.
+    assert [metrics["real_steps"] for metrics in results] == [150, 225]
+
+
+def test_without_l1_there_are_no_l1_metrics() -> None:
+    (metrics, _) = [result.metrics for result in make(l1=None).iterate()]
+    assert set(metrics) == {name for name in METRICS if not name.startswith("l1/")}
+
+
+def test_buffer_holds_the_policy_action_and_the_executed_one() -> None:
+    algorithm = make()
+    list(algorithm.iterate())
+    data = algorithm.buffer[:]
+    assert data.shape == (225,)
+    assert data["action"].abs().max() <= 3
+    random, learned = data[:75], data[75:]
+    assert torch.equal(random["action"], random["executed"])
+    assert not torch.allclose(learned["action"], learned["executed"])
+    assert 0 < data["validation"].float().mean() < 0.3
+
+
+def test_noise_on_the_actuator_is_not_in_the_data() -> None:
+    algorithm = METRPO(
+        "inverted_pendulum", tiny(), perturbation=Perturbation(actuator_bias=2.0), horizon=25
+    )
+    data = algorithm.collection.random(0)
+    assert data["action"].abs().max() <= 3
+    # The cart's first acceleration shows the bias all the same.
+    assert data["next", "observation"][:, 0, 2].mean() > 0.2
+
+
+@pytest.mark.parametrize("l1", [None, L1])
+def test_resumed_run_repeats_the_unbroken_one(l1: L1Config | None) -> None:
+    unbroken = [result.metrics for result in make(l1, outer_iterations=3).iterate()]
+    first = make(l1, outer_iterations=3)
+    iterations = first.iterate()
+    before = [next(iterations).metrics]
+    state = first.state_dict()
+    second = make(l1, outer_iterations=3)
+    second.load_state_dict(state)
+    after = [result.metrics for result in second.iterate()]
+    assert before + after == unbroken
+
+
+def test_seeds_matter() -> None:
+    first = next(make(seed=0).iterate()).metrics["return_mean"]
+    assert first == next(make(seed=0).iterate()).metrics["return_mean"]
+    assert first != next(make(seed=1).iterate()).metrics["return_mean"]
+
+
+def test_label_decides_what_the_model_is_fitted_to() -> None:
+    nominal, executed = (make(label=label) for label in ("nominal", "executed"))
+    results = [list(algorithm.iterate())[1] for algorithm in (nominal, executed)]
+    assert results[0].metrics["model/train_loss"] != results[1].metrics["model/train_loss"]
+    with pytest.raises(ValueError, match="label must be 'nominal' or 'executed', got 'both'"):
+        make(label="both")
+
+
+def test_a_few_iterations_learn_to_balance() -> None:
+    config = METRPOConfig(
+        outer_iterations=3,
+        episodes_per_iteration=15,
+        trpo_iterations=10,
+        imagined_steps=10_000,
+        imagined_horizon=100,
+        label="executed",
+        model=ModelConfig(members=3, hidden=[64, 64]),
+        policy=PolicyConfig(hidden=[32]),
+        fit=FitConfig(batch_size=200),
+        trpo=TRPOConfig(max_kl=0.03),
+    )
+    config.policy.std = 0.5
+    last = list(METRPO("inverted_pendulum", config, seed=0).iterate())[-1].metrics
+    assert last["return_deterministic"] > -20  # a random policy is at about -220
+
+
+def test_unknown_device_is_refused() -> None:
+    if torch.cuda.is_available():
+        pytest.skip("this machine has a CUDA device")
+    with pytest.raises(ValueError, match="no CUDA device"):
+        METRPO("inverted_pendulum", tiny(), device="cuda")

@@ -1,0 +1,277 @@
+from __future__ import annotations
+
+import copy
+import pickle
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_l1.envs import TASKS, BatchedMujocoEnv, BatchedSimulator
+
+GYM_IDS = {"inverted_pendulum": "InvertedPendulum-v5", "half_cheetah": "HalfCheetah-v5"}
+NAMES = list(GYM_IDS)
+
+
+def _step(env, action):
+    return env.step(TensorDict({"action": action}, batch_size=env.batch_size))["next"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_bit_equal_to_gymnasium_over_100_steps(name):
+    task, num_envs = TASKS[name], 3
+    env = BatchedMujocoEnv(name, num_envs, seed=1, dtype=torch.float64)
+    references = [gymnasium.make(GYM_IDS[name]).unwrapped for _ in range(num_envs)]
+    env.reset()
+    for index, reference in enumerate(references):
+        reference.reset(seed=0)
+        mujoco.mj_resetData(reference.model, reference.data)
+        qpos, qvel = env.simulator_state()
+        reference.set_state(qpos[index], qvel[index])
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        # Half again beyond the bounds: clamping is part of the physics and of the reward.
+        action = 1.5 * rng.uniform(task.action_low, task.action_high, (num_envs, task.action_dim))
+        rewards = []
+        for reference, row in zip(references, action, strict=True):
+            data = reference.data
+            if name == "inverted_pendulum":
+                rewards.append(-(data.qpos[1] ** 2))
+            else:
+                rewards.append(data.qvel[0] - 0.1 * np.sum(np.clip(row, -1, 1) ** 2))
+            reference.step(row)
+        following = _step(env, torch.from_numpy(action))
+        qpos, qvel = env.simulator_state()
+        np.testing.assert_array_equal(qpos, [r.data.qpos for r in references])
+        np.testing.assert_array_equal(qvel, [r.data.qvel for r in references])
+        skip = 1 if name == "half_cheetah" else 0
+        np.testing.assert_array_equal(
+            following["observation"].numpy(), np.concatenate([qpos[:, skip:], qvel], axis=1)
+        )
+        np.testing.assert_allclose(
+            following["reward"].squeeze(-1).numpy(), rewards, rtol=1e-14, atol=1e-15
+        )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_parity_survives_resets(name):
+    # A reset must leave nothing behind of the episode before (time, solver warm start).
+    used, fresh = (BatchedMujocoEnv(name, 2, seed=s, dtype=torch.float64) for s in (0, 1))
+    used.rollout(50)
+    used.reset()
+    fresh.reset()
+    fresh.set_simulator_state(*used.simulator_state())
+    for _ in range(20):
+        action = used.action_spec.rand()
+        torch.testing.assert_close(_step(used, action), _step(fresh, action), rtol=0, atol=0)
+
+
+def test_derived_quantities_belong_to_the_state_that_was_set():
+    simulator = BatchedSimulator(TASKS["inverted_pendulum"], 2)
+    simulator.set_state(np.array([[0.5, 0.0]]), np.zeros((1, 2)), [1])
+    assert [data.body("cart").xpos[0] for data in simulator.data] == [0.0, 0.5]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_specs(name, dtype):
+    env = BatchedMujocoEnv(name, 3, seed=0, dtype=dtype)
+    check_env_specs(env)
+    assert env.batch_size == (3,)
+    assert env.action_spec.space.low.unique().tolist() == [TASKS[name].action_low]
+    assert env.action_spec.space.high.unique().tolist() == [TASKS[name].action_high]
+
+
+@pytest.mark.parametrize(
+    ("name", "num_envs", "low", "high"),
+    # Random-policy returns: -219 +- 9 and -242 +- 42 (an independent reimplementation);
+    # -205 +- 14 and -288 +- 66 (arXiv:1907.02057).
+    [("inverted_pendulum", 50, -228, -210), ("half_cheetah", 25, -354, -200)],
+)
+def test_random_policy_returns(name, num_envs, low, high):
+    torch.manual_seed(0)
+    env = BatchedMujocoEnv(name, num_envs, seed=0)
+    returns = env.rollout(env.max_steps)["next", "reward"].sum(dim=(1, 2))
+    assert low < returns.mean() < high
+
+
+def test_truncates_at_the_horizon_and_only_there():
+    env = BatchedMujocoEnv("inverted_pendulum", 2, seed=0)
+    rollout = env.rollout(250, break_when_any_done=False)["next"]
+    ends = rollout["truncated"].squeeze(-1).nonzero()[:, 1].tolist()
+    assert ends == [99, 199, 99, 199]
+    assert not rollout["terminated"].any()
+    torch.testing.assert_close(rollout["done"], rollout["truncated"])
+    short = BatchedMujocoEnv("half_cheetah", 2, seed=0, max_steps=7)
+    assert short.rollout(100).shape == (2, 7)
+
+
+@given(mask=st.lists(st.booleans(), min_size=4, max_size=4), steps=st.integers(1, 9))
+@settings(max_examples=15, deadline=None)
+def test_partial_reset(mask, steps):
+    env = BatchedMujocoEnv("half_cheetah", 4, seed=0, max_steps=10, dtype=torch.float64)
+    twin = BatchedMujocoEnv("half_cheetah", 4, seed=0, max_steps=10, dtype=torch.float64)
+    current = env.reset()
+    twin.reset()
+    actions = torch.rand(10, 4, 6, dtype=torch.float64) * 2 - 1
+    for action in actions[:steps]:
+        current = _step(env, action)
+        _step(twin, action)
+    chosen = torch.tensor(mask)
+    before = current["observation"].clone()
+    after = env.reset(
+        TensorDict({"observation": before, "_reset": chosen.unsqueeze(-1)}, batch_size=[4])
+    )
+    assert torch.equal(after["observation"][~chosen], before[~chosen])
+    assert (after["observation"][chosen] != before[chosen]).all()
+    assert (after["observation"][chosen][:, :8].abs() <= 0.1).all()
+    for count, action in enumerate(actions[steps:], start=steps + 1):
+        ours, theirs = _step(env, action), _step(twin, action)
+        kept = ~chosen
+        assert torch.equal(ours["observation"][kept], theirs["observation"][kept])
+        assert ours["truncated"].squeeze(-1)[kept].tolist() == [count == 10] * int(kept.sum())
+        assert not ours["truncated"].squeeze(-1)[chosen].any()
+
+
+def test_seeds():
+    def record(env):
+        torch.manual_seed(5)
+        return env.rollout(30, break_when_any_done=False)
+
+    env = BatchedMujocoEnv("half_cheetah", 3, seed=7, max_steps=10)
+    first = record(env)
+    assert (record(BatchedMujocoEnv("half_cheetah", 3, seed=7, max_steps=10)) == first).all()
+    assert not torch.equal(record(env)["observation"], first["observation"])
+    env.set_seed(7)
+    assert (record(env) == first).all()
+    env.set_seed(8)
+    assert not torch.equal(record(env)["observation"], first["observation"])
+
+
+def test_without_a_seed_torch_manual_seed_decides():
+    torch.manual_seed(3)
+    first = BatchedMujocoEnv("half_cheetah", 2).reset()
+    second = BatchedMujocoEnv("half_cheetah", 2).reset()
+    torch.manual_seed(3)
+    again = BatchedMujocoEnv("half_cheetah", 2).reset()
+    assert torch.equal(first["observation"], again["observation"])
+    assert not torch.equal(first["observation"], second["observation"])
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e))])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_copies_continue_independently(duplicate, threads):
+    env = BatchedMujocoEnv("half_cheetah", 2, seed=0, dtype=torch.float64, threads=threads)
+    env.rollout(5)
+    twin = duplicate(env)
+    actions = torch.rand(5, 2, 6, dtype=torch.float64)
+    expected = [_step(env, a)["observation"] for a in actions]
+    found = [_step(twin, a)["observation"] for a in actions]
+    assert torch.equal(torch.stack(found), torch.stack(expected))
+    assert torch.equal(env.reset()["observation"], twin.reset()["observation"])
+
+
+def test_observations_do_not_alias_the_clean_state():
+    env = BatchedMujocoEnv("inverted_pendulum", 2, seed=0, dtype=torch.float64)
+    env.reset()["observation"].fill_(7.0)
+    qpos, qvel = env.simulator_state()
+    qpos[:], qvel[:] = 7.0, 7.0
+    following = _step(env, torch.zeros(2, 1))
+    assert (following["reward"].abs() <= 0.01**2).all()
+    following["observation"].fill_(7.0)
+    assert (_step(env, torch.zeros(2, 1))["reward"].abs() < 0.1).all()
+
+
+def test_a_diverging_simulation_ends_one_trajectory(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)  # MuJoCo leaves MUJOCO_LOG.TXT where it warns
+    env = BatchedMujocoEnv("half_cheetah", 3, seed=0, dtype=torch.float64)
+    twin = BatchedMujocoEnv("half_cheetah", 3, seed=0, dtype=torch.float64)
+    env.reset()
+    twin.reset()
+    qpos, qvel = env.simulator_state()
+    twin.set_simulator_state(qpos, qvel)
+    qvel[1, :] = 9e9
+    before = env.set_simulator_state(qpos, qvel)
+    action = torch.full((3, 6), 0.3, dtype=torch.float64)
+    found = env.step(TensorDict({"action": action}, batch_size=[3]))
+    following, expected = found["next"], _step(twin, action)
+    for key in ("non_finite", "terminated", "done"):
+        assert following[key].squeeze(-1).tolist() == [False, True, False]
+    assert not following["truncated"].any()
+    assert torch.equal(following["observation"][1], before[1])
+    assert following["reward"].isfinite().all()
+    for index in (0, 2):
+        assert torch.equal(following["observation"][index], expected["observation"][index])
+    # The usual machinery restarts it, and it is a normal environment again.
+    root = env.step_mdp(found)
+    root = env.maybe_reset(root)
+    assert not root["non_finite"].any()
+    assert not _step(env, action)["non_finite"].any()
+
+
+def test_a_bad_state_after_the_last_substep_is_noticed(monkeypatch):
+    env = BatchedMujocoEnv("inverted_pendulum", 2, seed=0)
+    before = env.reset()["observation"]
+    genuine, calls = mujoco.mj_step, []
+
+    def last_substep_breaks(model, data, nstep):
+        genuine(model, data, nstep=nstep)
+        calls.append(data)
+        if len(calls) == 2:
+            data.qvel[0] = np.nan
+
+    monkeypatch.setattr(mujoco, "mj_step", last_substep_breaks)
+    following = _step(env, torch.ones(2, 1))
+    assert following["non_finite"].squeeze(-1).tolist() == [False, True]
+    assert torch.equal(following["observation"][1], before[1])
+    assert not _step(env, torch.ones(2, 1))["non_finite"].any()
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1e11])
+def test_bad_actions_name_the_environment(value):
+    env = BatchedMujocoEnv("half_cheetah", 4, seed=0)
+    env.reset()
+    action = torch.zeros(4, 6)
+    action[2, 3] = value
+    with pytest.raises(ValueError, match="environment 2"):
+        _step(env, action)
+
+
+def test_bad_shapes():
+    env = BatchedMujocoEnv("half_cheetah", 4, seed=0)
+    env.reset()
+    with pytest.raises(ValueError, match=r"\(4, 1\), expected \(4, 6\)"):
+        _step(env, torch.zeros(4, 1))
+    qpos, qvel = env.simulator_state()
+    with pytest.raises(ValueError, match=r"qpos has shape \(4, 8\), expected \(4, 9\)"):
+        env.set_simulator_state(qpos[:, 1:], qvel)
+    with pytest.raises(ValueError, match=r"qvel has shape \(3, 9\), expected \(4, 9\)"):
+        env.set_simulator_state(qpos, qvel[1:])
+    with pytest.raises(ValueError, match="qpos has entries that are not finite"):
+        env.set_simulator_state(np.full_like(qpos, np.nan), qvel)
+
+
+@pytest.mark.parametrize("arguments", [{"num_envs": 0}, {"max_steps": 0}, {"threads": 0}])
+def test_bad_counts(arguments):
+    with pytest.raises(ValueError, match="must be at least 1"):
+        BatchedMujocoEnv("half_cheetah", **arguments)
+    with pytest.raises(KeyError, match="Available"):
+        BatchedMujocoEnv("cheetah")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_threads_change_nothing(name):
+    def record(threads):
+        torch.manual_seed(0)
+        env = BatchedMujocoEnv(name, 5, seed=0, max_steps=7, threads=threads)
+        return env.rollout(20, break_when_any_done=False)
+
+    expected = record(1)
+    for threads in (2, 3, 64):
+        assert (record(threads) == expected).all()

@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+
+from torchrl_l1.control import L1Config
+from torchrl_l1.envs import get_task
+from torchrl_l1.experiment.launch import compose
+from torchrl_l1.experiment.recipes import RecipeError, available_recipes, find_recipe
+from torchrl_l1.experiment.schema import METRPORecipe, l1_config
+
+RUN_DIR = "run_dir=unused"
+
+
+def typed(name: str, *overrides: str) -> METRPORecipe:
+    recipe = OmegaConf.to_object(compose(name, [RUN_DIR, *overrides]))
+    assert isinstance(recipe, METRPORecipe)
+    return recipe
+
+
+@pytest.mark.parametrize("name", available_recipes())
+@pytest.mark.parametrize("preset", ["cpu", "paper"])
+@pytest.mark.parametrize("l1", ["off", "paper", "reference", "slow"])
+def test_every_recipe_composes_and_says_which_task_it_is(name: str, preset: str, l1: str) -> None:
+    recipe = typed(name, f"preset={preset}", f"l1={l1}")
+    assert recipe.recipe == name
+    task = get_task(recipe.task)
+    controller = l1_config(recipe.l1, recipe.task)
+    assert (controller is None) == (l1 == "off")
+    if controller is not None:
+        assert controller.dt == task.dt
+        assert (controller.action_low, controller.action_high) == (
+            task.action_low,
+            task.action_high,
+        )
+
+
+@pytest.mark.parametrize("name", ["paper", "reference"])
+def test_presets_are_those_of_the_controller(name: str) -> None:
+    recipe = typed("metrpo/half_cheetah", f"l1={name}")
+    bounds = {"action_low": -1.0, "action_high": 1.0}
+    preset = getattr(L1Config, name)(0.05, epsilon=3.0, **bounds)
+    assert l1_config(recipe.l1, recipe.task) == replace(preset, alpha=0.35)
+    assert preset.filter_gain == 0.35
+
+
+def test_paper_preset_has_the_published_sizes() -> None:
+    recipe = typed("metrpo/half_cheetah", "preset=paper")
+    assert recipe.model.hidden == [1000] * 4
+    assert (recipe.imagined_horizon, recipe.fit.batch_size, recipe.fit.patience) == (1000, 1000, 20)
+    assert recipe.policy.hidden == [32, 32]
+
+
+@pytest.mark.parametrize(
+    ("noise", "expected"),
+    [("none", (0, 0)), ("action", (0.1, 0)), ("observation", (0, 0.1)), ("both", (0.1, 0.1))],
+)
+def test_noise_settings(noise: str, expected: tuple[float, float]) -> None:
+    perturbation = typed("metrpo/inverted_pendulum", f"noise={noise}").perturbation
+    assert (perturbation.action_noise, perturbation.observation_noise) == expected
+
+
+def test_typos_are_refused() -> None:
+    with pytest.raises(HydraException, match="sed"):
+        typed("metrpo/inverted_pendulum", "sed=3")
+    with pytest.raises(HydraException, match="epsillon"):
+        typed("metrpo/inverted_pendulum", "l1.epsillon=3")
+    with pytest.raises(HydraException, match="outer_iterations"):
+        typed("metrpo/inverted_pendulum", "outer_iterations=many")
+    with pytest.raises(RecipeError, match="Did you mean metrpo/half_cheetah"):
+        find_recipe("metrpo/half_cheeta")
+    with pytest.raises(RecipeError, match="does not exist"):
+        find_recipe("nowhere.yaml")
+
+
+def test_alpha_and_cutoff_together_are_refused() -> None:
+    recipe = typed("metrpo/inverted_pendulum", "l1.cutoff=5.0")
+    with pytest.raises(ValueError, match="cutoff"):
+        l1_config(recipe.l1, recipe.task)
+
+
+def test_a_users_own_recipe_builds_on_the_shipped_groups(tmp_path: Path) -> None:
+    own = tmp_path / "mine.yaml"
+    own.write_text(
+        "defaults: [metrpo_recipe, {l1: slow}, {noise: action}, _self_, {preset: cpu}]\n"
+        "recipe: mine\ntask: half_cheetah\n"
+    )
+    recipe = typed(str(own))
+    assert recipe.l1.alpha == 0.1
+    assert recipe.model.hidden == [256, 256]

@@ -1,0 +1,149 @@
+from __future__ import annotations
+
+import csv
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_l1.algorithms.metrpo import METRICS
+from torchrl_l1.experiment.run import run
+from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
+
+Recipe = Callable[..., DictConfig]
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {
+        str(file.relative_to(folder)): file.read_bytes()
+        for file in sorted(folder.rglob("*"))
+        if file.is_file()
+    }
+
+
+def test_run_directory_has_what_is_promised(tiny_recipe: Recipe) -> None:
+    directory = run(tiny_recipe("seed=5"))
+    with (directory / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2
+    assert set(rows[0]) == set(METRICS)
+    config = OmegaConf.load(directory / "config.yaml")
+    assert (config.seed, config.task, config.l1.enabled) == (5, "inverted_pendulum", True)
+    assert json.loads((directory / "versions.json").read_text())["torch"] == torch.__version__
+    for name in ("model.pt", "policy.pt", "checkpoint.pt"):
+        assert torch.load(directory / name, weights_only=True)
+    assert not list(directory.glob("*.tmp"))
+
+
+def test_finished_run_is_left_alone_and_found_complete(
+    tiny_recipe: Recipe, capsys: pytest.CaptureFixture[str]
+) -> None:
+    directory = run(tiny_recipe())
+    before = snapshot(directory)
+    with pytest.raises(RunDirectoryError, match="already holds a run"):
+        run(tiny_recipe())
+    with pytest.raises(RunDirectoryError, match=r"seed: 0 there, 1 now"):
+        run(tiny_recipe("seed=1", "resume=true"))
+    assert snapshot(directory) == before
+    run(tiny_recipe("resume=true"))
+    assert "complete" in capsys.readouterr().out
+    assert snapshot(directory) == before
+
+
+def test_foreign_directory_is_not_touched(tiny_recipe: Recipe, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "thesis.tex").write_text("years of work")
+    before = snapshot(tmp_path)
+    for resume in ("true", "false"):
+        with pytest.raises(RunDirectoryError, match="not empty"):
+            run(tiny_recipe(f"resume={resume}"))
+    assert snapshot(tmp_path) == before
+
+
+def test_second_process_in_the_same_directory_is_refused(tmp_path: Path) -> None:
+    first = RunDirectory(tmp_path / "run")
+    first.open({"seed": 0}, resume=False)
+    with pytest.raises(RunDirectoryError, match="another process"):
+        RunDirectory(tmp_path / "run").open({"seed": 0}, resume=True)
+
+
+def test_bad_settings_are_refused_before_anything_is_written(
+    tiny_recipe: Recipe, tmp_path: Path
+) -> None:
+    for override, message in [
+        ("label=both", "label must be"),
+        ("task=pendulum", "Unknown task"),
+        ("wandb.mode=loud", "wandb.mode"),
+        ("l1.on_switch=forget", "on_switch"),
+        ("l1.epsilon=-1", "epsilon"),
+        ("model.activation=gelu", "activation"),
+        ("policy.std=0", "standard deviation"),
+        ("device=tpu", "device"),
+    ]:
+        with pytest.raises((ValueError, KeyError, RuntimeError), match=message):
+            run(tiny_recipe(override))
+        assert not (tmp_path / "run").exists(), override
+
+
+def test_wandb_offline_keeps_everything(
+    tiny_recipe: Recipe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    monkeypatch.delenv("WANDB_API_KEY", raising=False)
+    directory = run(tiny_recipe("wandb.mode=offline"))
+    (record,) = directory.glob("wandb/offline-run-*/*.wandb")
+    content = record.read_bytes()
+    for key in (b"return_mean", b"l1/switch_rate", b"inverted_pendulum", b"max_gradient_steps"):
+        assert key in content
+
+
+def test_killed_run_resumes_to_the_same_metrics(tmp_path: Path, tiny_overrides: list[str]) -> None:
+    command = [
+        *(sys.executable, "-m", "torchrl_l1.cli", "run", "metrpo/inverted_pendulum"),
+        *tiny_overrides,
+        "outer_iterations=5",
+        "fit.max_epochs=40",
+        "fit.patience=40",
+    ]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+
+    def finish(folder: Path) -> str:
+        subprocess.run(
+            [*command, f"run_dir={folder}", "--resume"],
+            env=environment,
+            check=True,
+            capture_output=True,
+            timeout=300,
+        )
+        return (folder / "metrics.csv").read_text()
+
+    unbroken = finish(tmp_path / "unbroken")
+    rng, killed = random.Random(0), tmp_path / "killed"
+    for rows_before_kill in (1, 3):
+        process = subprocess.Popen(
+            [*command, f"run_dir={killed}", "--resume"],
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        while process.poll() is None and rows(killed) < rows_before_kill:
+            time.sleep(0.005)
+        time.sleep(rng.uniform(0, 0.3))
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+    assert rows(killed) < 5
+    assert finish(killed) == unbroken
+
+
+def rows(folder: Path) -> int:
+    file = folder / "metrics.csv"
+    return len(file.read_text().splitlines()) - 1 if file.exists() else 0

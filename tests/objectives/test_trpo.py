@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch.distributions import kl_divergence
+from torch.nn.utils import parameters_to_vector
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_l1.algorithms.policy import GaussianPolicy, make_actor
+from torchrl_l1.objectives import TRPOConfig, conjugate_gradient, trpo_step
+from torchrl_l1.objectives.trpo import _fisher_product
+
+
+@given(size=st.integers(1, 12), seed=st.integers(0, 1000))
+@settings(max_examples=30, deadline=None)
+def test_conjugate_gradient_solves_positive_definite_systems(size: int, seed: int) -> None:
+    torch.manual_seed(seed)
+    root = torch.randn(size, size).double()
+    matrix = root @ root.T + torch.eye(size).double()
+    b = torch.randn(size).double()
+    solution = conjugate_gradient(lambda v: matrix @ v, b, iterations=3 * size, tolerance=1e-24)
+    torch.testing.assert_close(solution, torch.linalg.solve(matrix, b), rtol=1e-6, atol=1e-8)
+
+
+def batch(actor: torch.nn.Module, size: int = 400) -> TensorDict:
+    data = TensorDict({"observation": torch.randn(size, 3)}, batch_size=[size])
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        data = actor(data)
+    # Acting along the first observation pays.
+    data["advantage"] = data["action"][:, :1] * data["observation"][:, :1]
+    return data.select("observation", "action", "advantage")
+
+
+def test_fisher_product_is_that_of_a_gaussian() -> None:
+    torch.manual_seed(0)
+    policy = GaussianPolicy(3, 2, (), std=0.5).double()
+    actor = make_actor(policy)
+    data = batch(actor.float(), 50)
+    policy.double()
+    data = data.double()
+    parameters = list(actor.parameters())
+    config = TRPOConfig(damping=0.0, fisher_fraction=1.0)
+    product = _fisher_product(actor, data, parameters, config)
+    # Mean linear in x: the block of each output's weights is E[x x^T] / std^2, bias included.
+    x = torch.cat([data["observation"], torch.ones(50, 1).double()], dim=1)
+    second_moment = x.T @ x / 50 / 0.25
+    names = [name for name, _ in policy.named_parameters()]
+    sizes = {name: p.numel() for name, p in policy.named_parameters()}
+    offsets = {n: sum(sizes[k] for k in names[:i]) for i, n in enumerate(names)}
+    weight, bias, log_std = offsets["mean.0.weight"], offsets["mean.0.bias"], offsets["log_std"]
+    dense = torch.stack([product(row) for row in torch.eye(sum(sizes.values())).double()])
+    first_output = [weight, weight + 1, weight + 2, bias]
+    torch.testing.assert_close(dense[first_output][:, first_output], second_moment)
+    torch.testing.assert_close(dense[log_std, log_std], torch.tensor(2.0).double())
+
+
+def test_step_improves_the_surrogate_within_the_trust_region() -> None:
+    torch.manual_seed(0)
+    actor = make_actor(GaussianPolicy(3, 2, (16,), std=0.7))
+    data = batch(actor)
+    with torch.no_grad():
+        before = actor.get_dist(data)
+        log_prob = before.log_prob(data["action"])
+    report = trpo_step(actor, data, TRPOConfig(max_kl=0.02, fisher_fraction=1.0))
+    with torch.no_grad():
+        after = actor.get_dist(data)
+        gain = ((after.log_prob(data["action"]) - log_prob).exp() - 1) * data["advantage"][:, 0]
+    assert report.accepted
+    assert gain.mean().item() == pytest.approx(report.improvement, rel=1e-3)
+    assert gain.mean() > 0
+    assert kl_divergence(before, after).mean().item() == pytest.approx(report.kl, rel=1e-3)
+    assert 0.005 < report.kl <= 0.02
+
+
+def test_repeated_steps_find_the_rewarded_action() -> None:
+    torch.manual_seed(0)
+    policy = GaussianPolicy(3, 2, (16,), std=0.5)
+    actor = make_actor(policy)
+    for _ in range(30):
+        assert trpo_step(actor, batch(actor), TRPOConfig(max_kl=0.05)).kl <= 0.05
+    probe = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    first_action = policy(probe)[0][:, 0]
+    assert first_action[0] > 0.3
+    assert first_action[1] < -0.3
+
+
+def test_rejected_step_leaves_the_parameters_alone() -> None:
+    torch.manual_seed(0)
+    actor = make_actor(GaussianPolicy(3, 2, (8,)))
+    data = batch(actor)
+    before = parameters_to_vector(actor.parameters()).clone()
+    report = trpo_step(actor, data, TRPOConfig(accept_ratio=1e6))
+    assert not report.accepted
+    assert torch.equal(parameters_to_vector(actor.parameters()), before)
+
+
+def test_no_gradient_no_step() -> None:
+    actor = make_actor(GaussianPolicy(3, 2, (8,)))
+    data = batch(actor)
+    data["advantage"] = torch.zeros(400, 1)
+    before = parameters_to_vector(actor.parameters()).clone()
+    assert not trpo_step(actor, data, TRPOConfig()).accepted
+    assert torch.equal(parameters_to_vector(actor.parameters()), before)
+
+
+def test_broken_advantages_are_refused() -> None:
+    actor = make_actor(GaussianPolicy(3, 2, (8,)))
+    data = batch(actor)
+    data["advantage"][3] = float("nan")
+    with pytest.raises(ValueError, match="non-finite advantages"):
+        trpo_step(actor, data, TRPOConfig())

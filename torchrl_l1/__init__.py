@@ -1,0 +1,35 @@
+"""Robust model-based reinforcement learning with L1 adaptive control, for TorchRL.
+
+The names users compose are exported here; everything else lives in the sub-packages ``control``,
+``dynamics``, ``envs``, ``objectives``, ``algorithms`` and ``experiment``.
+"""
+
+from torchrl_l1._version import __version__
+from torchrl_l1.algorithms import METRPO, METRPOConfig
+from torchrl_l1.control import (
+    ActionJacobian,
+    Affinizer,
+    L1Config,
+    L1Controller,
+    L1State,
+    L1Transform,
+)
+from torchrl_l1.dynamics import EnsembleDynamics, EnsembleDynamicsLoss, EnsembleModelEnv
+from torchrl_l1.envs import BatchedMujocoEnv, make_env
+
+__all__ = [
+    "METRPO",
+    "ActionJacobian",
+    "Affinizer",
+    "BatchedMujocoEnv",
+    "EnsembleDynamics",
+    "EnsembleDynamicsLoss",
+    "EnsembleModelEnv",
+    "L1Config",
+    "L1Controller",
+    "L1State",
+    "L1Transform",
+    "METRPOConfig",
+    "__version__",
+    "make_env",
+]

@@ -1,0 +1,169 @@
+"""Real data: the environment with its perturbations, with L1 on or off, behind a collector."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase, RewardSum, TransformedEnv
+from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_type
+
+from torchrl_l1.algorithms.seeding import stream_seed
+from torchrl_l1.control import L1Config, L1Transform
+from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.envs import Task, make_env
+
+_L1_MEANS = {
+    "switch": "switch_rate",
+    "saturation": "saturation",
+    "ill_conditioned": "ill_conditioned",
+}
+_L1_MEANS_AND_MAXIMA = ("affinization_error", "prediction_error", "matched", "unmatched", "u_a")
+
+
+@dataclass
+class Perturbation:
+    """What the real environment does that the model is not told.
+
+    Attributes:
+        action_noise: half-width of uniform noise on the executed action, action units.
+        observation_noise: half-width of uniform noise on the observation, raw state units.
+        actuator_bias: constant added to the executed action, action units.
+        actuator_gain: factor on the executed action.
+    """
+
+    action_noise: float = 0.0
+    observation_noise: float = 0.0
+    actuator_bias: float = 0.0
+    actuator_gain: float = 1.0
+
+
+def make_pipeline(
+    task: Task,
+    num_envs: int,
+    perturbation: Perturbation,
+    dynamics: EnsembleDynamics,
+    l1: L1Config | None,
+    horizon: int | None = None,
+) -> TransformedEnv:
+    """The perturbed environment, augmented by L1 unless ``l1`` is ``None``.
+
+    The order matters: on its way in, an action meets L1 first and the noise last; on its way
+    out, an observation is noisy before L1 sees it.
+    """
+    extra = [] if l1 is None else [L1Transform(dynamics, l1)]
+    return make_env(
+        task,
+        num_envs,
+        action_noise=perturbation.action_noise,
+        observation_noise=perturbation.observation_noise,
+        actuator_bias=perturbation.actuator_bias,
+        actuator_gain=perturbation.actuator_gain,
+        max_steps=horizon,
+        extra_transforms=[RewardSum(), *extra],
+    )
+
+
+class Collection:
+    """Collects whole episodes, ``episodes`` of them side by side.
+
+    Every call starts from a fresh reset and a fresh seed, so that no state outlives it.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        episodes: int,
+        policy: TensorDictModuleBase,
+        dynamics: EnsembleDynamics,
+        l1: L1Config | None,
+        perturbation: Perturbation,
+        horizon: int | None = None,
+    ) -> None:
+        self.horizon = horizon or task.horizon
+        self.frames = episodes * self.horizon
+        self.policy = policy
+        self.env = make_pipeline(task, episodes, perturbation, dynamics, l1, horizon)
+        self._policy_batches = self._batches(self.env, policy)
+        # Random data never pass through L1: there is no model yet.
+        bare = make_pipeline(task, episodes, perturbation, dynamics, None, horizon)
+        self._random_env = bare
+        self._random_batches = self._batches(bare, RandomPolicy(bare.full_action_spec))
+
+    def _batches(
+        self, env: TransformedEnv, policy: TensorDictModuleBase
+    ) -> Iterator[TensorDictBase]:
+        collector = Collector(
+            env,
+            policy,
+            frames_per_batch=self.frames,
+            total_frames=-1,
+            reset_at_each_iter=True,
+            exploration_type=ExplorationType.RANDOM,
+            auto_register_policy_transforms=False,
+        )
+        return iter(collector)
+
+    def random(self, seed: int) -> TensorDictBase:
+        """Episodes ``[N, T]`` of uniformly random actions."""
+        self._random_env.set_seed(stream_seed(seed, "random") % 2**31)
+        return _with_executed(next(self._random_batches))
+
+    def collect(self, seed: int, iteration: int) -> TensorDictBase:
+        """Episodes ``[N, T]`` of the stochastic policy, through L1 if it is on."""
+        self.env.set_seed(stream_seed(seed, "collect", iteration) % 2**31)
+        return _with_executed(next(self._policy_batches))
+
+    def evaluate(
+        self,
+        seed: int,
+        iteration: int = 0,
+        deterministic: bool = True,
+        steps: int | None = None,
+        callback: Callable[[EnvBase, TensorDictBase], object] | None = None,
+    ) -> TensorDictBase:
+        """As many extra episodes ``[N, T]``, of the policy's mean or sampled actions.
+
+        ``callback`` is called after every step with the environment and the data so far.
+        """
+        self.env.set_seed(stream_seed(seed, "evaluate", iteration) % 2**31)
+        kind = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
+        with torch.no_grad(), set_exploration_type(kind):
+            return self.env.rollout(
+                steps or self.horizon, self.policy, callback=callback, break_when_any_done=False
+            )
+
+    def metrics(self, data: TensorDictBase) -> dict[str, float]:
+        """Returns of the finished episodes in ``data`` and means and maxima of L1's signals."""
+        returns = episode_returns(data)
+        metrics = {
+            "return_mean": returns.mean().item(),
+            "return_std": returns.std(correction=0).item(),
+            "return_min": returns.min().item(),
+            "return_max": returns.max().item(),
+            "episodes": returns.numel(),
+            "non_finite_steps": int(data["next", "non_finite"].sum()),
+        }
+        signals = data.get(("next", "l1"), None)
+        if signals is not None:
+            for name, label in _L1_MEANS.items():
+                metrics[f"l1/{label}"] = signals[name].float().mean().item()
+            for name in _L1_MEANS_AND_MAXIMA:
+                metrics[f"l1/{name}"] = signals[name].mean().item()
+                metrics[f"l1/{name}_max"] = signals[name].max().item()
+        return metrics
+
+
+def episode_returns(data: TensorDictBase) -> Tensor:
+    """Undiscounted returns of the episodes that ended within ``data``: ``(episodes,)``."""
+    return data["next", "episode_reward"][data["next", "done"]]
+
+
+def _with_executed(data: TensorDictBase) -> TensorDictBase:
+    executed = data.get(("next", "l1", "u_exec"), None)
+    return data.set("executed", data["action"] if executed is None else executed)

@@ -1,0 +1,83 @@
+"""Gaussian policies as TorchRL actors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.modules import IndependentNormal, ProbabilisticActor
+
+
+class GaussianPolicy(nn.Module):
+    """Tanh network for the mean, a free parameter for the logarithm of the standard deviation.
+
+    Args:
+        observation_dim: number of observations, n.
+        action_dim: number of actions, m.
+        hidden: widths of the hidden layers.
+        std: initial standard deviation, in action units.
+    """
+
+    def __init__(
+        self, observation_dim: int, action_dim: int, hidden: Sequence[int], std: float = 1.0
+    ) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        widths = [observation_dim, *hidden]
+        for fan_in, fan_out in pairwise(widths):
+            layers += [_normalized_linear(fan_in, fan_out, 1.0), nn.Tanh()]
+        # A small last layer: the first policy is close to zero-mean noise.
+        layers.append(_normalized_linear(widths[-1], action_dim, 0.01))
+        self.mean = nn.Sequential(*layers)
+        self.log_std = nn.Parameter(torch.zeros(action_dim))
+        self.reset_std(std)
+
+    @torch.no_grad()
+    def reset_std(self, std: float) -> None:
+        """Set the standard deviation of every action entry."""
+        if std <= 0:
+            raise ValueError(f"the policy's standard deviation must be positive, got {std}")
+        self.log_std.fill_(torch.tensor(std).log())
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation ``(..., m)`` for observations ``(..., n)``."""
+        loc = self.mean(observation)
+        return loc, self.log_std.exp().expand_as(loc)
+
+    def sample(self, observation: Tensor) -> Tensor:
+        """One action per observation: ``(..., n)`` to ``(..., m)``."""
+        loc, scale = self(observation)
+        return torch.addcmul(loc, scale, torch.randn_like(loc))
+
+
+def _normalized_linear(fan_in: int, fan_out: int, norm: float) -> nn.Linear:
+    """Linear layer whose rows have the given norm and whose biases are zero."""
+    layer = nn.Linear(fan_in, fan_out)
+    with torch.no_grad():
+        layer.weight.normal_()
+        layer.weight.mul_(norm / layer.weight.norm(dim=1, keepdim=True))
+        layer.bias.zero_()
+    return layer
+
+
+def make_actor(policy: GaussianPolicy) -> ProbabilisticActor:
+    """TorchRL actor around the policy: ``observation`` to ``loc``, ``scale`` and ``action``."""
+    return ProbabilisticActor(
+        TensorDictModule(policy, in_keys=["observation"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+    )
+
+
+def clipped(actor: ProbabilisticActor, low: Tensor, high: Tensor) -> TensorDictSequential:
+    """The actor followed by clipping ``action`` to its bounds: what acts on a real system.
+
+    Both arms of a comparison, with and without L1, act and store clipped actions.
+    """
+    clip = TensorDictModule(
+        lambda action: action.clamp(low, high), in_keys=["action"], out_keys=["action"]
+    )
+    return TensorDictSequential(actor, clip)

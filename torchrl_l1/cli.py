@@ -1,0 +1,106 @@
+"""The command ``torchrl-l1``: run, evaluate, verify."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+
+DESCRIPTION = "Robust model-based reinforcement learning with L1 adaptive control."
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Entry point of the console script. Exits with status 1 on a refused request."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    parser = argparse.ArgumentParser("torchrl-l1", description=DESCRIPTION)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _run_parser(commands)
+    _evaluate_parser(commands)
+    verify = commands.add_parser(
+        "verify", help="replay recorded traces of a reference controller in float64"
+    )
+    verify.add_argument("traces", help="an .npz file of recorded traces")
+    verify.add_argument("--tolerance", type=float, default=1e-9, help="largest error allowed")
+    commands.add_parser("recipes", help="list the shipped recipes")
+
+    options, rest = parser.parse_known_args(arguments)
+    if rest and options.command != "run":
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    # Imports wait until the arguments are known to be right: torch takes seconds to load.
+    from torchrl_l1.experiment.errors import USER_ERRORS
+
+    try:
+        if options.command == "run":
+            _run(options, rest)
+        elif options.command == "evaluate":
+            from torchrl_l1.experiment.evaluate import evaluate_command
+
+            evaluate_command(options)
+        elif options.command == "verify":
+            from torchrl_l1.experiment.verify import verify_command
+
+            if not verify_command(options.traces, options.tolerance):
+                sys.exit(1)
+        else:
+            from torchrl_l1.experiment.recipes import available_recipes
+
+            print("\n".join(available_recipes()))
+    except USER_ERRORS as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        print(f"torchrl-l1 {options.command}: {_message(error)}", file=sys.stderr)
+        sys.exit(1)
+
+
+def _message(error: BaseException) -> str:
+    # KeyError quotes its message like a key.
+    return str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+
+
+def _run_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    run = commands.add_parser(
+        "run",
+        help="run a recipe",
+        description="A Hydra application: overrides (seed=3 l1=off noise=action), sweeps (-m) "
+        "and Hydra's own flags (--cfg job, --info) work as usual.",
+    )
+    run.add_argument("recipe", help="such as metrpo/inverted_pendulum, or a YAML file of yours")
+    run.add_argument("--resume", action="store_true", help="continue from the last checkpoint")
+
+
+def _evaluate_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    evaluate = commands.add_parser(
+        "evaluate",
+        help="evaluate trained policies with L1 on and off under noise and disturbances",
+        description="Frozen policy and model, every combination of L1, noise, disturbance and "
+        "stochastic or deterministic policy. Several run directories are seeds of one study.",
+    )
+    add = evaluate.add_argument
+    add("run_dir", nargs="+", help="one or more run directories")
+    add("--l1", nargs="+", default=["off", "paper"], help="settings of the l1 group")
+    add("--noise", nargs="+", default=["none"], help="settings of the noise group")
+    add("--bias", nargs="+", type=float, default=[0.0], help="actuator biases, action units")
+    add("--gain", nargs="+", type=float, default=[1.0], help="actuator gains")
+    add("--epsilon", type=float, help="tolerance of the switching law; the run's own by default")
+    add(
+        "--policy",
+        nargs="+",
+        default=["stochastic", "deterministic"],
+        choices=["stochastic", "deterministic"],
+        help="sampled or mean actions",
+    )
+    add("--episodes", type=int, default=25, help="episodes per cell and run")
+    add("--seed", type=int, default=0, help="seed of resets, noise and sampled actions")
+    add("--output", help="folder of the results; RUN_DIR/evaluation by default")
+    add("--filmstrip", action="store_true", help="also render L1 off and on at the worst bias")
+
+
+def _run(options: argparse.Namespace, overrides: list[str]) -> None:
+    from torchrl_l1.experiment.launch import launch
+
+    launch(options.recipe, overrides + (["resume=true"] if options.resume else []))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,40 @@
+"""L1 adaptive control around learned dynamics.
+
+The core is pure (:func:`step`, :func:`augment`); :class:`L1Transform` and :class:`L1Controller`
+put it into an environment or behind a policy.
+"""
+
+from torchrl_l1.control.affine import (
+    AffineModel,
+    Linearization,
+    linearize,
+    relinearize,
+    switching_law,
+)
+from torchrl_l1.control.affinizer import Affinizer
+from torchrl_l1.control.augmentation import augment
+from torchrl_l1.control.controller import L1Controller
+from torchrl_l1.control.jacobian import ActionJacobian, DynamicsModel
+from torchrl_l1.control.law import L1Config, L1Diagnostics, L1State, init, step
+from torchrl_l1.control.least_squares import solve_matched
+from torchrl_l1.control.transform import L1Transform
+
+__all__ = [
+    "ActionJacobian",
+    "AffineModel",
+    "Affinizer",
+    "DynamicsModel",
+    "L1Config",
+    "L1Controller",
+    "L1Diagnostics",
+    "L1State",
+    "L1Transform",
+    "Linearization",
+    "augment",
+    "init",
+    "linearize",
+    "relinearize",
+    "solve_matched",
+    "step",
+    "switching_law",
+]

@@ -1,0 +1,92 @@
+"""Optional compilation of a pure function."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FunctionType
+from typing import Any, Literal
+
+import torch
+
+CompileMode = bool | Literal["auto"]
+
+
+def compiled(function: FunctionType, mode: CompileMode) -> Callable[..., Any]:
+    """The function, compiled with ``fullgraph=True`` or not.
+
+    Args:
+        function: a pure function of tensors.
+        mode: ``False`` returns the function itself; ``True`` compiles it and lets a failing
+            compiler raise; ``"auto"`` compiles it and falls back to the function where there
+            is no working compiler.
+
+    Raises:
+        ValueError: for any other mode.
+    """
+    if mode is False:
+        return function
+    if mode is True or mode == "auto":
+        return _Compiled(function, fall_back=mode == "auto")
+    raise ValueError(f"compile must be True, False or 'auto', got {mode!r}")
+
+
+class _Compiled:
+    """A compiled function which, if so asked, becomes the plain one once compiling fails."""
+
+    def __init__(self, function: FunctionType, fall_back: bool) -> None:
+        self._function = function
+        self._fall_back = fall_back
+        self._compiled: Callable[..., Any] | None = torch.compile(
+            _with_own_code(function), fullgraph=True
+        )
+        self._called = False
+
+    def __call__(self, *args: Any) -> Any:
+        if self._compiled is None:
+            return self._function(*args)
+        if self._called and not self._fall_back:
+            return self._compiled(*args)
+        try:
+            if self._called:
+                return self._compiled(*args)
+            with _quiet(silence_errors=self._fall_back):
+                result = self._compiled(*args)
+            self._called = True
+            return result
+        except Exception:
+            if not self._fall_back:
+                raise
+        # If the arguments are at fault, this raises the function's own, clearer error.
+        result = self._function(*args)
+        self._compiled = None
+        return result
+
+
+def _with_own_code(function: FunctionType) -> FunctionType:
+    # torch keeps compiled graphs, eight at most, by code object, and closures made by the same
+    # definition share theirs: the ninth controller of a process would fail to compile.
+    return FunctionType(
+        function.__code__.replace(),
+        function.__globals__,
+        function.__name__,
+        function.__defaults__,
+        function.__closure__,
+    )
+
+
+@contextmanager
+def _quiet(silence_errors: bool) -> Iterator[None]:
+    # The first use of the compiler imports modules of torch that warn of their own deprecation,
+    # and without a C++ compiler it logs at length; falling back is no news.
+    disabled = logging.root.manager.disable
+    try:
+        if silence_errors:
+            logging.disable(logging.ERROR)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(disabled)

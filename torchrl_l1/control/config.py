@@ -1,0 +1,208 @@
+"""Settings of the L1 controller."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass
+from typing import Any, Literal, get_args
+
+OnSwitch = Literal["keep", "reset"]
+SwitchOn = Literal["policy", "executed"]
+FilterInput = Literal["current", "previous"]
+Scalars = float | tuple[float, ...]
+
+DEFAULT_ALPHA = 0.35
+"""Filter gain per step when neither ``alpha`` nor ``cutoff`` is given: cutoff = 0.35 / dt."""
+
+_CHOICES = {
+    "on_switch": get_args(OnSwitch),
+    "switch_on": get_args(SwitchOn),
+    "filter_input": get_args(FilterInput),
+}
+
+
+@dataclass(frozen=True)
+class L1Config:
+    r"""Settings of the L1 adaptive controller (arXiv 2403.14860, sections 3.1 and 3.2).
+
+    The defaults are those of the paper's Algorithms 1 and 2; :meth:`reference` gives the
+    settings of the authors' released controller.
+
+    Args:
+        dt: sampling time :math:`T_s`: the time of one environment step, in seconds.
+        epsilon: largest error of the affine model, Euclidean norm in raw state units, before
+            the operating point moves. It depends on the task's scale: the paper uses 0.3 to 3.
+        cutoff: cutoff frequency :math:`\omega` of the low-pass filter, in rad/s.
+        alpha: filter gain per step, :math:`\alpha = \omega T_s`, in [0, 1]. Give ``cutoff`` or
+            ``alpha`` or neither (then 0.35); 0 estimates without acting.
+        a_s: diagonal of the predictor's Hurwitz matrix :math:`A_s`, in 1/s: one negative number
+            or one per observation.
+        on_switch: what a switch does to the predictor and the filter: ``"keep"`` them, as in
+            the paper, or ``"reset"`` both, as the released code.
+        switch_on: the input that the switching law tests: the one ``"executed"`` or that of the
+            ``"policy"``.
+        filter_input: the estimate that the filter takes in: the ``"previous"`` step's, as in
+            the paper's control law, or the ``"current"`` one, as the released code.
+        action_low: lower bound of the executed action, a number or one per action dimension;
+            ``None`` for no bound.
+        action_high: upper bound of the executed action.
+
+    Raises:
+        ValueError: for a setting out of its domain, or settings that exclude each other.
+
+    Examples:
+        >>> L1Config(0.04).filter_gain
+        0.35
+        >>> L1Config(0.02, cutoff=10.0).filter_gain
+        0.2
+        >>> L1Config.reference(0.04, epsilon=3.0).on_switch
+        'reset'
+    """
+
+    dt: float
+    _: KW_ONLY
+    epsilon: float = 1.0
+    cutoff: float | None = None
+    alpha: float | None = None
+    a_s: Scalars = -1.0
+    on_switch: OnSwitch = "keep"
+    switch_on: SwitchOn = "executed"
+    filter_input: FilterInput = "previous"
+    action_low: Scalars | None = None
+    action_high: Scalars | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("dt", "epsilon", "cutoff", "alpha"):
+            value = getattr(self, name)
+            if value is not None and not (_is_real(value) and math.isfinite(value)):
+                raise ValueError(f"{name} must be a finite number, got {value!r}")
+        if self.dt <= 0:
+            raise ValueError(f"dt must be a positive time in seconds, got {self.dt}")
+        if self.epsilon < 0:
+            raise ValueError(f"epsilon must not be negative, got {self.epsilon}")
+        for name, choices in _CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name} must be one of {choices}, got {getattr(self, name)!r}")
+        for name in ("a_s", "action_low", "action_high"):
+            object.__setattr__(self, name, _as_scalars(name, getattr(self, name)))
+        self._check_filter()
+        self._check_predictor()
+        self._check_bounds()
+
+    def _check_filter(self) -> None:
+        if self.cutoff is not None and self.alpha is not None:
+            raise ValueError(
+                "give the filter's cutoff (rad/s) or its gain per step alpha, not both: "
+                f"got cutoff={self.cutoff} and alpha={self.alpha}"
+            )
+        if not 0 <= self.filter_gain <= 1:
+            source = "alpha" if self.cutoff is None else "cutoff * dt"
+            raise ValueError(f"{source} must lie in [0, 1], got {self.filter_gain}")
+
+    def _check_predictor(self) -> None:
+        for rate in _tuple(self.a_s):
+            if not (rate < 0 and math.isfinite(rate)):
+                raise ValueError(f"a_s must be negative (a Hurwitz matrix), got {self.a_s}")
+            # The prediction error is multiplied by 1 - gain + T a_s at every step.
+            if _adaptation_gain(rate, self.dt) - self.dt * rate >= 2:
+                raise ValueError(
+                    f"a_s={rate} is too fast for dt={self.dt}: the sampled state predictor would "
+                    f"be unstable; keep -a_s * dt below about 1.59"
+                )
+
+    def _check_bounds(self) -> None:
+        if self.action_low is None or self.action_high is None:
+            return
+        low, high = _tuple(self.action_low), _tuple(self.action_high)
+        if len(low) > 1 and len(high) > 1 and len(low) != len(high):
+            raise ValueError(
+                f"action_low has {len(low)} entries and action_high has {len(high)}: give one "
+                "number or one per action dimension"
+            )
+        width = max(len(low), len(high))
+        low, high = low * (width // len(low)), high * (width // len(high))
+        if not all(a < b for a, b in zip(low, high, strict=True)):
+            raise ValueError(
+                "action_low must be below action_high, "
+                f"got action_low={self.action_low} and action_high={self.action_high}"
+            )
+        if isinstance(self.action_low, tuple) or isinstance(self.action_high, tuple):
+            object.__setattr__(self, "action_low", low)
+            object.__setattr__(self, "action_high", high)
+
+    @classmethod
+    def paper(cls, dt: float, *, epsilon: float = 1.0, **settings: Any) -> L1Config:
+        """The paper's Algorithms 1 and 2: predictor and filter are kept at a switch."""
+        return cls(dt, epsilon=epsilon, **settings)
+
+    @classmethod
+    def reference(cls, dt: float, *, epsilon: float = 1.0, **settings: Any) -> L1Config:
+        """The authors' released controller: restarted at every switch."""
+        reference: dict[str, Any] = {
+            "on_switch": "reset",
+            "switch_on": "policy",
+            "filter_input": "current",
+        }
+        return cls(dt, epsilon=epsilon, **(reference | settings))
+
+    @property
+    def filter_gain(self) -> float:
+        r"""Gain :math:`\alpha = \omega T_s` of the discrete low-pass filter."""
+        if self.cutoff is not None:
+            return self.cutoff * self.dt
+        return DEFAULT_ALPHA if self.alpha is None else self.alpha
+
+    @property
+    def adaptation_gain(self) -> Scalars:
+        r"""Diagonal of :math:`T_s \Phi^{-1} \exp(A_s T_s)`, dimensionless.
+
+        For eigenvalue :math:`\lambda` this is :math:`-\lambda T / (\exp(-\lambda T) - 1)`,
+        which tends to 1 as T tends to 0.
+        """
+        return _map(lambda rate: _adaptation_gain(rate, self.dt), self.a_s)
+
+    @property
+    def predictor_gain(self) -> Scalars:
+        r"""Diagonal of what multiplies the prediction error in the predictor's step.
+
+        The adaptation gain less :math:`A_s T_s`: the estimate and the stabilising term together.
+        """
+        return _map(lambda rate: _adaptation_gain(rate, self.dt) - self.dt * rate, self.a_s)
+
+    def check_dimensions(self, observation_dim: int, action_dim: int) -> None:
+        """Raise ``ValueError`` where a setting given per dimension has the wrong length."""
+        widths = {"a_s": observation_dim, "action_low": action_dim, "action_high": action_dim}
+        for name, width in widths.items():
+            value = getattr(self, name)
+            if isinstance(value, tuple) and len(value) != width:
+                raise ValueError(
+                    f"{name} has {len(value)} entries, expected one number or {width} "
+                    f"(observation width {observation_dim}, action width {action_dim})"
+                )
+
+
+def _adaptation_gain(rate: float, dt: float) -> float:
+    # expm1 because exp(z) - 1 loses half the digits at the small z of a fast controller.
+    return -rate * dt / math.expm1(-rate * dt)
+
+
+def _is_real(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _as_scalars(name: str, value: Any) -> Scalars | None:
+    if value is None:
+        return None
+    entries = value if isinstance(value, Sequence) and not isinstance(value, str) else (value,)
+    if not entries or not all(_is_real(entry) and not math.isnan(entry) for entry in entries):
+        raise ValueError(f"{name} must be a number or a non-empty list of numbers, got {value!r}")
+    return float(value) if entries == (value,) else tuple(float(entry) for entry in entries)
+
+
+def _tuple(value: Scalars) -> tuple[float, ...]:
+    return value if isinstance(value, tuple) else (value,)
+
+
+def _map(function: Callable[[float], float], value: Scalars) -> Scalars:
+    return tuple(map(function, value)) if isinstance(value, tuple) else function(value)

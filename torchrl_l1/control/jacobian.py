@@ -1,0 +1,203 @@
+"""A model's predicted change of state and its derivative with respect to the action."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Literal, Protocol, runtime_checkable
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+Predicts = Literal["change", "next_observation"]
+ChangeFunction = Callable[[Tensor, Tensor], Tensor]
+
+
+@runtime_checkable
+class DynamicsModel(Protocol):
+    """What the L1 controller needs of a learned model.
+
+    A model may also have ``value_and_jacobian(observation, action)``, which returns the same
+    change ``(..., n)`` together with its derivative with respect to the action ``(..., n, m)``
+    in raw units; it is then used in place of automatic differentiation.
+    """
+
+    def mean_change(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Predicted change of state: ``(..., n)`` and ``(..., m)`` to ``(..., n)``."""
+        ...
+
+
+class ActionJacobian:
+    r"""Value :math:`\hat f(x, u)` and Jacobian :math:`\nabla_u \hat f(x, u)` of any dynamics model.
+
+    The Jacobian is analytic where the model has a ``value_and_jacobian`` method. Otherwise the
+    m unit tangents of the action are pushed forward through the model on the whole batch
+    (forward-mode differentiation under ``vmap``), at the cost of about ``1 + m`` forward passes.
+
+    The model is referred to, never copied nor registered as a submodule: weights updated in
+    place are seen at the next call, and it keeps its own device and train mode.
+
+    Args:
+        dynamics: a :class:`DynamicsModel`, a TensorDictModule that reads ``observation_key``
+            and ``action_key``, or a function of the two tensors.
+        observation_key: key under which a TensorDictModule reads the observation.
+        action_key: key under which it reads the action.
+        out_key: key of its prediction; needed if it has several output keys.
+        predicts: whether it predicts the ``"change"`` of state or the ``"next_observation"``.
+        ensemble_dim: dimension of its output over which the mean is taken, for a module that
+            returns one prediction per ensemble member.
+
+    Raises:
+        TypeError: if ``dynamics`` is none of the above.
+        ValueError: if the options do not fit the model.
+
+    Examples:
+        >>> jacobian = ActionJacobian(lambda x, u: 0.1 * x + u.square() @ torch.ones(1, 3))
+        >>> value, matrix = jacobian.value_and_jacobian(torch.zeros(5, 3), torch.ones(5, 1))
+        >>> matrix[0].squeeze(-1)
+        tensor([2., 2., 2.])
+    """
+
+    def __init__(
+        self,
+        dynamics: DynamicsModel | TensorDictModuleBase | ChangeFunction,
+        *,
+        observation_key: NestedKey = "observation",
+        action_key: NestedKey = "action",
+        out_key: NestedKey | None = None,
+        predicts: Predicts = "change",
+        ensemble_dim: int | None = None,
+    ) -> None:
+        if predicts not in ("change", "next_observation"):
+            raise ValueError(f"predicts must be 'change' or 'next_observation', got {predicts!r}")
+        self.dynamics = dynamics
+        self.predicts = predicts
+        self.ensemble_dim = ensemble_dim
+        self.analytic = callable(getattr(dynamics, "value_and_jacobian", None))
+        self._predict: ChangeFunction
+        if isinstance(dynamics, DynamicsModel):
+            if predicts != "change" or ensemble_dim is not None or out_key is not None:
+                raise ValueError(
+                    f"{type(dynamics).__name__} has a mean_change method, which gives the mean "
+                    "change of state: predicts, ensemble_dim and out_key do not apply to it"
+                )
+            self._predict = dynamics.mean_change
+        elif self.analytic:
+            raise TypeError(
+                f"{type(dynamics).__name__} has value_and_jacobian but no mean_change(observation, "
+                "action)"
+            )
+        elif isinstance(dynamics, TensorDictModuleBase):
+            self._predict = _on_tensors(dynamics, observation_key, action_key, out_key)
+        elif callable(dynamics):
+            if out_key is not None:
+                raise ValueError("out_key applies to TensorDictModules only")
+            self._predict = dynamics
+        else:
+            raise TypeError(
+                "dynamics must have a mean_change(observation, action) method, be a "
+                f"TensorDictModule or a callable, got {type(dynamics).__name__}"
+            )
+        if not self.analytic:
+            _load_forward_mode()
+
+    @property
+    def dtype(self) -> torch.dtype | None:
+        """Type of the model's floating-point parameters, ``None`` if it has none."""
+        if isinstance(self.dynamics, nn.Module):
+            for parameter in self.dynamics.parameters():
+                if parameter.is_floating_point():
+                    return parameter.dtype
+        return None
+
+    def check_dimensions(self, observation_dim: int, action_dim: int) -> None:
+        """Raise ``ValueError`` if the model declares other widths than these."""
+        for name, width in (("observation_dim", observation_dim), ("action_dim", action_dim)):
+            declared = getattr(self.dynamics, name, None)
+            if isinstance(declared, int) and declared != width:
+                raise ValueError(
+                    f"{type(self.dynamics).__name__} has {name}={declared}, but the data have "
+                    f"width {width}"
+                )
+
+    def value(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Predicted change of state: ``(..., n)`` and ``(..., m)`` to ``(..., n)``."""
+        prediction = self._predict(observation, action)
+        if self.ensemble_dim is not None:
+            prediction = prediction.mean(self.ensemble_dim)
+        if prediction.shape != observation.shape:
+            raise ValueError(
+                f"the dynamics returned shape {tuple(prediction.shape)} for observations of shape "
+                f"{tuple(observation.shape)} and actions of shape {tuple(action.shape)}; expected "
+                "the observation's shape (for one prediction per ensemble member give "
+                "ensemble_dim)"
+            )
+        return prediction - observation if self.predicts == "next_observation" else prediction
+
+    def value_and_jacobian(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Predicted change ``(..., n)`` and its derivative by the action ``(..., n, m)``."""
+        if not self.analytic:
+            return self._forward_mode(observation, action)
+        value, jacobian = self.dynamics.value_and_jacobian(observation, action)  # type: ignore[union-attr]
+        expected = (*observation.shape, action.shape[-1])
+        if jacobian.shape != expected:
+            raise ValueError(
+                f"{type(self.dynamics).__name__}.value_and_jacobian returned a Jacobian of shape "
+                f"{tuple(jacobian.shape)}, expected {expected}"
+            )
+        return value, jacobian
+
+    __call__ = value_and_jacobian
+
+    def _forward_mode(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        def push_forward(tangent: Tensor) -> tuple[Tensor, Tensor]:
+            value, column = torch.func.jvp(
+                lambda u: self.value(observation, u), (action,), (tangent.expand_as(action),)
+            )
+            return value, column
+
+        basis = torch.eye(action.shape[-1], dtype=action.dtype, device=action.device)
+        value, jacobian = torch.func.vmap(push_forward, out_dims=(None, -1))(basis)
+        return value, jacobian
+
+
+def _load_forward_mode() -> None:
+    # The first jvp of a process loads torch's decompositions, which warn of torch's own
+    # deprecations. Get that over with here, where it can be silenced without hiding anything
+    # that the model itself may warn of.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.func.jvp(torch.sin, (torch.zeros(()),), (torch.ones(()),))
+
+
+def _on_tensors(
+    module: TensorDictModuleBase,
+    observation_key: NestedKey,
+    action_key: NestedKey,
+    out_key: NestedKey | None,
+) -> ChangeFunction:
+    unknown = [key for key in module.in_keys if key not in (observation_key, action_key)]
+    if unknown or len(module.in_keys) != 2:
+        raise ValueError(
+            f"the dynamics module reads {module.in_keys}; it must read exactly "
+            f"{observation_key!r} and {action_key!r} (see observation_key and action_key)"
+        )
+    if out_key is None:
+        if len(module.out_keys) != 1:
+            raise ValueError(
+                f"the dynamics module writes {module.out_keys}: name its prediction with out_key"
+            )
+        out_key = module.out_keys[0]
+    elif out_key not in module.out_keys:
+        raise ValueError(f"the dynamics module writes {module.out_keys}, not out_key={out_key!r}")
+
+    def predict(observation: Tensor, action: Tensor) -> Tensor:
+        data = TensorDict({}, batch_size=observation.shape[:-1])
+        data.set(observation_key, observation)
+        data.set(action_key, action)
+        return module(data).get(out_key)
+
+    return predict

@@ -1,0 +1,231 @@
+"""The L1 adaptive law in discrete time: state predictor, adaptation law, low-pass filter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrl_l1.control.config import FilterInput, L1Config, OnSwitch, Scalars, SwitchOn
+from torchrl_l1.control.least_squares import solve_matched
+
+__all__ = [
+    "FilterInput",
+    "L1Config",
+    "L1Diagnostics",
+    "L1State",
+    "OnSwitch",
+    "SwitchOn",
+    "filtered",
+    "init",
+    "saturate",
+    "step",
+]
+
+
+class L1State(NamedTuple):
+    """What the controller remembers from one step to the next.
+
+    Attributes:
+        x_hat: predicted observation ``(..., n)``.
+        u_bar: operating point of the affine model ``(..., m)``.
+        q: filter state ``(..., m)``; the adaptive input is ``-q``.
+        sigma_m: matched uncertainty estimated at the last step ``(..., m)``, action units.
+        n_switch: switches since the reset ``(..., 1)``, int64.
+        started: whether the other entries mean anything ``(..., 1)``, bool.
+    """
+
+    x_hat: Tensor
+    u_bar: Tensor
+    q: Tensor
+    sigma_m: Tensor
+    n_switch: Tensor
+    started: Tensor
+
+
+class L1Diagnostics(NamedTuple):
+    """Signals of one step, each ``(..., 1)``; norms are Euclidean.
+
+    Attributes:
+        switch: the operating point moved (bool).
+        affinization_error: error of the affine model at the tested input, state units.
+        prediction_error: norm of the state prediction error, state units.
+        matched: norm of the matched part of the uncertainty estimate, state units per second.
+        unmatched: norm of the part that no action can cancel, state units per second.
+        u_a: norm of the adaptive input before saturation, action units.
+        saturation: fraction of the action's entries that a bound cut.
+        ill_conditioned: the matched part came from damped least squares (bool).
+        non_finite: an input was not finite: L1 stood aside and restarts (bool).
+    """
+
+    switch: Tensor
+    affinization_error: Tensor
+    prediction_error: Tensor
+    matched: Tensor
+    unmatched: Tensor
+    u_a: Tensor
+    saturation: Tensor
+    ill_conditioned: Tensor
+    non_finite: Tensor
+
+
+def init(
+    batch_size: Sequence[int],
+    observation_dim: int,
+    action_dim: int,
+    *,
+    dtype: torch.dtype | None = None,
+    device: torch.device | str | None = None,
+) -> L1State:
+    """State before the first step: zeros, not started.
+
+    Examples:
+        >>> init([5], observation_dim=4, action_dim=1).x_hat.shape
+        torch.Size([5, 4])
+    """
+
+    def zeros(width: int, dtype: torch.dtype | None) -> Tensor:
+        return torch.zeros(*batch_size, width, dtype=dtype, device=device)
+
+    return L1State(
+        x_hat=zeros(observation_dim, dtype),
+        u_bar=zeros(action_dim, dtype),
+        q=zeros(action_dim, dtype),
+        sigma_m=zeros(action_dim, dtype),
+        n_switch=zeros(1, torch.int64),
+        started=zeros(1, torch.bool),
+    )
+
+
+def saturate(config: L1Config, action: Tensor) -> Tensor:
+    """The action within the configured bounds."""
+    low, high = config.action_low, config.action_high
+    if isinstance(low, tuple) or isinstance(high, tuple):
+        # The configuration expands a number beside a tuple, so neither is a plain number here.
+        low_bound = None if low is None else _like(action, low)
+        high_bound = None if high is None else _like(action, high)
+        return torch.clamp(action, low_bound, high_bound)  # type: ignore[arg-type]
+    if low is None and high is None:
+        return action
+    return torch.clamp(action, low, high)
+
+
+def filtered(config: L1Config, q: Tensor, sigma_m: Tensor) -> Tensor:
+    r"""Next state of the low-pass filter, :math:`q + \alpha (\sigma_m - q)`.
+
+    This is arXiv 2403.14860, control law of section 3.2, with :math:`K = \omega I`.
+    """
+    return torch.lerp(q, sigma_m, config.filter_gain)
+
+
+def step(
+    config: L1Config,
+    state: L1State,
+    observation: Tensor,
+    u_rl: Tensor,
+    drift: Tensor,
+    jacobian: Tensor,
+    restart: Tensor | None = None,
+) -> tuple[Tensor, L1State, L1Diagnostics]:
+    r"""One step of the L1 adaptive controller on the affine model ``x' = x + drift + jacobian u``.
+
+    arXiv 2403.14860, Algorithm 1 and the discrete-time law of section 3.2. With
+    :math:`\tilde x = \hat x - x` the prediction error, :math:`T` the sampling time and
+    :math:`A_s` diagonal,
+
+    .. math::
+
+        \hat\sigma &= -\Phi^{-1} \exp(A_s T)\, \tilde x,
+            \qquad \Phi = A_s^{-1} (\exp(A_s T) - I) \\
+        J \sigma_m &\approx T \hat\sigma \quad\text{(least squares)} \\
+        q &\leftarrow q + \alpha (\sigma_m - q) \\
+        u &= \mathrm{clip}(u_{RL} - q) \\
+        \hat x &\leftarrow \hat x + f + J u + T (\hat\sigma + A_s \tilde x)
+
+    The estimate :math:`\hat\sigma` is in state units per second and the matched part
+    :math:`\sigma_m` in action units. What the least squares leaves over is unmatched: it enters
+    the prediction and no action cancels it. The predictor sees the saturated input.
+
+    Pure, batched over leading dimensions and free of data-dependent branches. Where any input
+    of an environment is not finite the output is ``u_rl``, ``non_finite`` is set and that
+    environment restarts at its next step; the others are not touched.
+
+    Args:
+        config: the settings; switching fields other than the filter's are not used here.
+        state: from :func:`init` or the previous step.
+        observation: ``(..., n)``, raw units.
+        u_rl: the policy's action ``(..., m)``; clipped to the bounds first.
+        drift: ``(..., n)``, state units per step.
+        jacobian: ``(..., n, m)``, state units per step and action unit.
+        restart: ``(..., 1)`` bool, where predictor and filter start afresh before this step.
+
+    Returns:
+        the executed input ``(..., m)``, the next state and the diagnostics (the two of the
+        switching law, which this function does not evaluate, hold ``restart`` and zeros).
+
+    Examples:
+        >>> config = L1Config(0.04, action_low=-1.0, action_high=1.0)
+        >>> state = init([2], observation_dim=3, action_dim=1)
+        >>> x, drift, u_rl = torch.zeros(2, 3), torch.zeros(2, 3), torch.full((2, 1), 0.5)
+        >>> u, state, diagnostics = step(config, state, x, u_rl, drift, torch.ones(2, 3, 1))
+        >>> u.squeeze(-1)
+        tensor([0.5000, 0.5000])
+        >>> state.x_hat[0]
+        tensor([0.5000, 0.5000, 0.5000])
+    """
+    fresh = ~state.started if restart is None else ~state.started | restart
+    u_rl = saturate(config, u_rl)
+    x_hat = torch.where(fresh, observation, state.x_hat)
+    q = torch.where(fresh, 0.0, state.q)
+    previous_sigma_m = torch.where(fresh, 0.0, state.sigma_m)
+
+    # State prediction error, estimate and its matched part. Everything is in state units per
+    # step here: this is T sigma_hat, so that no division by a small T enters the state.
+    x_err = x_hat - observation
+    estimate = x_err * -_like(x_err, config.adaptation_gain)
+    sigma_m, ill_conditioned = solve_matched(jacobian, estimate)
+
+    # Control input.
+    filter_input = previous_sigma_m if config.filter_input == "previous" else sigma_m
+    q = filtered(config, q, filter_input)
+    unbounded = u_rl - q
+    u = saturate(config, unbounded)
+
+    # State predictor.
+    effect_u, effect_sigma_m = (jacobian @ torch.stack([u, sigma_m], dim=-1)).unbind(-1)
+    x_hat = x_hat + drift + effect_u - x_err * _like(x_err, config.predictor_gain)
+
+    finite = x_hat.sum(-1, keepdim=True).isfinite()
+    norms = torch.linalg.vector_norm(
+        torch.stack([x_err, effect_sigma_m, estimate - effect_sigma_m], dim=-2), dim=-1
+    )
+    norms = torch.where(finite, norms, 0.0)
+    next_state = L1State(
+        x_hat=torch.where(finite, x_hat, 0.0),
+        u_bar=state.u_bar,
+        q=torch.where(finite, q, 0.0),
+        sigma_m=torch.where(finite, sigma_m, 0.0),
+        n_switch=state.n_switch,
+        started=finite,
+    )
+    diagnostics = L1Diagnostics(
+        switch=torch.zeros_like(finite) if restart is None else restart,
+        affinization_error=torch.zeros_like(norms[..., :1]),
+        prediction_error=norms[..., :1],
+        matched=norms[..., 1:2] / config.dt,
+        unmatched=norms[..., 2:] / config.dt,
+        u_a=torch.linalg.vector_norm(next_state.q, dim=-1, keepdim=True),
+        saturation=((u != unbounded) & finite).to(u.dtype).mean(-1, keepdim=True),
+        ill_conditioned=ill_conditioned,
+        non_finite=~finite,
+    )
+    return torch.where(finite, u, u_rl), next_state, diagnostics
+
+
+def _like(tensor: Tensor, value: Scalars) -> Tensor | float:
+    # Numbers stay numbers: they need no device and cost no kernel.
+    if isinstance(value, tuple):
+        return torch.tensor(value, dtype=tensor.dtype, device=tensor.device)
+    return value

@@ -1,0 +1,154 @@
+"""Layout of the controller's state and signals in a tensordict."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_l1.control import law
+from torchrl_l1.control.law import L1Config, L1Diagnostics, L1State
+
+L1_KEY = "l1"
+"""Default key of the nested tensordict that holds the controller's state and signals."""
+
+_FLAGS = ("switch", "ill_conditioned", "non_finite")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Shapes and types of the controller's entries for one environment.
+
+    Attributes:
+        batch_size: the environment's batch size.
+        observation_dim: width of the observation, n.
+        action_dim: width of the action, m.
+        dtype: type in which the controller computes.
+        action_dtype: type of the action.
+        device: the environment's device.
+        low: lower action bound of the action spec, per dimension; ``None`` if unbounded.
+        high: upper action bound.
+    """
+
+    batch_size: torch.Size
+    observation_dim: int
+    action_dim: int
+    dtype: torch.dtype
+    action_dtype: torch.dtype
+    device: torch.device | None = None
+    low: tuple[float, ...] | None = None
+    high: tuple[float, ...] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        env: EnvBase,
+        observation_key: NestedKey,
+        action_key: NestedKey,
+        dtype: torch.dtype | None = None,
+    ) -> Layout:
+        """Layout for an environment; ``dtype`` is the observation's if ``None``.
+
+        Raises:
+            KeyError: if the environment has no such observation or action.
+            ValueError: if they are not vectors of floating-point numbers.
+        """
+        observation = _vector_spec(env, "observation", observation_key)
+        action = _vector_spec(env, "action", action_key)
+        low, high = _bounds(action)
+        return cls(
+            batch_size=env.batch_size,
+            observation_dim=observation.shape[-1],
+            action_dim=action.shape[-1],
+            dtype=observation.dtype if dtype is None else dtype,
+            action_dtype=action.dtype,
+            device=env.device,
+            low=low,
+            high=high,
+        )
+
+    def bounded(self, config: L1Config) -> L1Config:
+        """The configuration with open action bounds filled from the action spec."""
+        low = self.low if config.action_low is None else config.action_low
+        high = self.high if config.action_high is None else config.action_high
+        return replace(config, action_low=low, action_high=high)
+
+    def state_spec(self) -> Composite:
+        """Spec of an :class:`~torchrl_l1.control.law.L1State`, one entry per field."""
+        state = law.init([], self.observation_dim, self.action_dim, dtype=self.dtype)
+        return self._composite(
+            {name: (value.shape[-1], value.dtype) for name, value in state._asdict().items()}
+        )
+
+    def spec(self, diagnostics: bool = True) -> Composite:
+        """Spec of the state, the executed input ``u_exec`` and, if wanted, the diagnostics."""
+        entries = {"u_exec": (self.action_dim, self.action_dtype)}
+        if diagnostics:
+            for name in L1Diagnostics._fields:
+                entries[name] = (1, torch.bool if name in _FLAGS else self.dtype)
+        spec = self.state_spec()
+        spec.update(self._composite(entries))
+        return spec
+
+    def zero(self, batch_size: torch.Size, diagnostics: bool = True) -> TensorDictBase:
+        """Entries of a controller that has not started."""
+        # An environment that is not batch-locked decides on more dimensions at reset.
+        extra = batch_size[: len(batch_size) - len(self.batch_size)]
+        return self.spec(diagnostics).zero(extra)
+
+    def _composite(self, entries: dict[str, tuple[int, torch.dtype]]) -> Composite:
+        specs: dict[str, TensorSpec] = {}
+        for name, (width, dtype) in entries.items():
+            shape = torch.Size([*self.batch_size, width])
+            kind = Binary if dtype == torch.bool else Unbounded
+            specs[name] = kind(shape=shape, dtype=dtype, device=self.device)
+        return Composite(specs, shape=self.batch_size, device=self.device)
+
+
+def pack(
+    executed: Tensor,
+    state: L1State,
+    diagnostics: L1Diagnostics | None,
+    batch_size: torch.Size,
+    device: torch.device | None = None,
+) -> TensorDict:
+    """Nested tensordict of the next state, the executed input and the diagnostics."""
+    entries: dict[str, Tensor] = state._asdict()
+    entries["u_exec"] = executed
+    if diagnostics is not None:
+        entries.update(diagnostics._asdict())
+    return TensorDict(entries, batch_size=batch_size, device=device)
+
+
+def _vector_spec(env: EnvBase, kind: str, key: NestedKey) -> TensorSpec:
+    specs = env.full_observation_spec if kind == "observation" else env.full_action_spec
+    if key not in specs.keys(include_nested=True, leaves_only=True):
+        found = sorted(map(str, specs.keys(include_nested=True, leaves_only=True)))
+        raise KeyError(f"the environment has no {kind} {key!r}, only {found}: see {kind}_key")
+    spec = specs[key]
+    if not spec.dtype.is_floating_point or spec.ndim != len(env.batch_size) + 1:
+        raise ValueError(
+            f"L1 needs a vector of floating-point numbers as {kind} {key!r}, but its spec has "
+            f"shape {tuple(spec.shape)} and type {spec.dtype}"
+        )
+    return spec
+
+
+def _bounds(action: TensorSpec) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
+    if not isinstance(action, Bounded):
+        return None, None
+    low, high = (
+        bound.expand(action.shape).reshape(-1, action.shape[-1])
+        for bound in (action.space.low, action.space.high)
+    )
+    if (low != low[0]).any() or (high != high[0]).any():
+        raise ValueError(
+            "the environments have different action bounds: give L1 the bounds to use as "
+            "action_low and action_high"
+        )
+    return tuple(low[0].tolist()), tuple(high[0].tolist())

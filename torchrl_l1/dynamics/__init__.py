@@ -1,0 +1,27 @@
+"""Learned models of the dynamics: batched ensembles, their training and their use."""
+
+from torchrl_l1.dynamics.ensemble import EnsembleMLP
+from torchrl_l1.dynamics.fit import FitConfig, FitReport, evaluate_members, fit_ensemble
+from torchrl_l1.dynamics.heads import DeterministicHead, Head
+from torchrl_l1.dynamics.imagination import imagine
+from torchrl_l1.dynamics.loss import EnsembleDynamicsLoss
+from torchrl_l1.dynamics.model import EnsembleDynamics
+from torchrl_l1.dynamics.model_env import EnsembleModelEnv, EnsembleWorldModel
+from torchrl_l1.dynamics.normalizer import DataBox, Normalizer
+
+__all__ = [
+    "DataBox",
+    "DeterministicHead",
+    "EnsembleDynamics",
+    "EnsembleDynamicsLoss",
+    "EnsembleMLP",
+    "EnsembleModelEnv",
+    "EnsembleWorldModel",
+    "FitConfig",
+    "FitReport",
+    "Head",
+    "Normalizer",
+    "evaluate_members",
+    "fit_ensemble",
+    "imagine",
+]

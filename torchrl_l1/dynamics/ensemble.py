@@ -1,0 +1,137 @@
+"""An ensemble of multi-layer perceptrons evaluated as one batched network."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+ActivationName = Literal["relu", "tanh", "silu"]
+
+
+def _relu(z: Tensor) -> tuple[Tensor, Tensor]:
+    return z.relu(), (z > 0).to(z.dtype)
+
+
+def _tanh(z: Tensor) -> tuple[Tensor, Tensor]:
+    value = z.tanh()
+    return value, 1 - value * value
+
+
+def _silu(z: Tensor) -> tuple[Tensor, Tensor]:
+    gate = z.sigmoid()
+    value = z * gate
+    return value, gate + value * (1 - gate)
+
+
+_VALUE: dict[str, Callable[[Tensor], Tensor]] = {
+    "relu": torch.relu,
+    "tanh": torch.tanh,
+    "silu": nn.functional.silu,
+}
+_VALUE_AND_DERIVATIVE: dict[str, Callable[[Tensor], tuple[Tensor, Tensor]]] = {
+    "relu": _relu,
+    "tanh": _tanh,
+    "silu": _silu,
+}
+
+
+class EnsembleMLP(nn.Module):
+    """``members`` perceptrons of equal shape, their weights stacked along a leading dimension.
+
+    All members are evaluated by one batched matrix product per layer. Hidden layers share an
+    activation, the output is linear. Weights start Glorot-uniform, biases at zero, each member
+    with its own draw.
+
+    Args:
+        in_features: input width.
+        out_features: output width.
+        hidden: widths of the hidden layers.
+        members: number of networks, E.
+        activation: ``"relu"``, ``"tanh"`` or ``"silu"``.
+
+    Raises:
+        ValueError: for an unknown activation or a width below one.
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        hidden: Sequence[int],
+        members: int,
+        activation: ActivationName = "relu",
+    ) -> None:
+        super().__init__()
+        if activation not in _VALUE:
+            raise ValueError(f"activation must be one of {sorted(_VALUE)}, got {activation!r}")
+        widths = [in_features, *hidden, out_features]
+        if members < 1 or min(widths) < 1:
+            raise ValueError(f"members and widths must be positive, got {members} and {widths}")
+        self.members = members
+        self.activation = activation
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
+        for fan_in, fan_out in pairwise(widths):
+            bound = math.sqrt(6 / (fan_in + fan_out))
+            weight = torch.empty(members, fan_in, fan_out).uniform_(-bound, bound)
+            self.weights.append(nn.Parameter(weight))
+            self.biases.append(nn.Parameter(torch.zeros(members, 1, fan_out)))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """All members on shared ``(B, in)`` or their own ``(E, B, in)`` inputs: ``(E, B, out)``."""
+        if x.dim() == 2:
+            x = x.expand(self.members, *x.shape)
+        activation = _VALUE[self.activation]
+        last = len(self.weights) - 1
+        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            x = torch.baddbmm(bias, x, weight)
+            if layer < last:
+                x = activation(x)
+        return x
+
+    def forward_member(self, x: Tensor, member: int) -> Tensor:
+        """One member alone: ``(B, in)`` to ``(B, out)``."""
+        activation = _VALUE[self.activation]
+        last = len(self.weights) - 1
+        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            x = torch.addmm(bias[member], x, weight[member])
+            if layer < last:
+                x = activation(x)
+        return x
+
+    def value_and_directional_derivatives(
+        self, x: Tensor, first: int, last: int
+    ) -> tuple[Tensor, Tensor]:
+        """Outputs and their derivatives with respect to the input columns ``first:last``.
+
+        The tangent of an input column passes the first layer as a row of its weights, whatever
+        the sample; from there on the ``d = last - first`` tangents of a sample travel through
+        each layer's matrix product together with its value, so the cost is that of about
+        ``1 + d`` forward passes without the first layer.
+
+        Args:
+            x: inputs ``(B, in)``.
+            first: first column differentiated.
+            last: column after the last one differentiated.
+
+        Returns:
+            outputs ``(E, B, out)`` and derivatives ``(E, B, d, out)``.
+        """
+        batch, directions = x.shape[0], last - first
+        activation = _VALUE_AND_DERIVATIVE[self.activation]
+        shared = x.expand(self.members, *x.shape)
+        z = torch.baddbmm(self.biases[0], shared, self.weights[0])
+        tangent = self.weights[0][:, None, first:last, :].expand(-1, batch, -1, -1)
+        for weight, bias in zip(self.weights[1:], self.biases[1:], strict=True):
+            value, derivative = activation(z)
+            stacked = torch.cat([value[:, :, None], tangent * derivative[:, :, None]], dim=2)
+            stacked = torch.bmm(stacked.flatten(1, 2), weight)
+            stacked = stacked.unflatten(1, (batch, 1 + directions))
+            z = stacked[:, :, 0] + bias
+            tangent = stacked[:, :, 1:]
+        return z, tangent

@@ -1,0 +1,76 @@
+"""Imagined rollouts: a policy in a learned model, as a plain torch loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torchrl_l1.dynamics.model import EnsembleDynamics
+
+
+@torch.no_grad()
+def imagine(
+    dynamics: EnsembleDynamics,
+    policy: Callable[[Tensor], Tensor],
+    reward: Callable[[Tensor, Tensor, Tensor], Tensor],
+    start: Tensor,
+    horizon: int,
+    action_low: Tensor,
+    action_high: Tensor,
+) -> TensorDict:
+    """Roll a policy out in the ensemble, one random member per step for the whole batch.
+
+    A trajectory that leaves the box around the data ends there: the model knows nothing
+    outside, and rewards imagined there grow without bound. Model and reward see the clipped
+    action; what is stored is the policy's sample, whose likelihood the policy gradient needs.
+
+    Args:
+        dynamics: the model; a member is drawn at each step (arXiv 1802.10592).
+        policy: maps observations ``(B, n)`` to sampled actions ``(B, m)``.
+        reward: maps observation, clipped action and next observation to ``(B,)``.
+        start: first observations ``(B, n)``.
+        horizon: number of steps, T.
+        action_low: lower bounds ``(m,)``.
+        action_high: upper bounds ``(m,)``.
+
+    Returns:
+        trajectories of batch size ``[B, T]`` with ``observation``, ``action``, ``step``
+        ``(B, T, 1)``, ``valid`` ``(B, T, 1)`` (still inside the box when the step was taken)
+        and ``next``: ``observation``, ``reward``, ``done``, ``terminated``.
+    """
+    batch, device = start.shape[0], start.device
+    members = torch.randint(dynamics.members, (horizon,)).tolist()
+    observations = start.new_empty(horizon + 1, batch, start.shape[-1])
+    actions = start.new_empty(horizon, batch, action_low.shape[-1])
+    rewards = start.new_empty(horizon, batch)
+    inside = torch.empty(horizon, batch, dtype=torch.bool, device=device)
+    observations[0] = observation = start
+    for t, member in enumerate(members):
+        actions[t] = action = policy(observation)
+        clipped = action.clamp(action_low, action_high)
+        successor = observation + dynamics.member_change(observation, clipped, member)
+        rewards[t] = reward(observation, clipped, successor)
+        inside[t] = within = dynamics.box.contains(successor)
+        # A trajectory that left stays where it last was inside, so that nothing overflows.
+        observation = torch.where(within[:, None], successor, observation)
+        observations[t + 1] = observation
+    left = ~inside
+    valid = (left.long().cumsum(0) - left.long()) == 0
+    done = left.clone()
+    done[-1] = True
+    columns = {
+        "observation": observations[:-1],
+        "action": actions,
+        "step": torch.arange(horizon, device=device)[:, None, None].expand(-1, batch, 1),
+        "valid": valid[..., None],
+        "next": {
+            "observation": observations[1:],
+            "reward": rewards[..., None],
+            "done": done[..., None],
+            "terminated": left[..., None],
+        },
+    }
+    return TensorDict(columns, batch_size=[horizon, batch]).transpose(0, 1)

@@ -1,0 +1,132 @@
+"""A learned model of the dynamics: normalisers around an ensemble."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_l1.dynamics.ensemble import ActivationName, EnsembleMLP
+from torchrl_l1.dynamics.heads import DeterministicHead
+from torchrl_l1.dynamics.normalizer import DataBox, Normalizer
+
+
+class EnsembleDynamics(nn.Module):
+    r"""Ensemble model of the change of state, :math:`x_{t+1} - x_t = \hat f(x_t, u_t)`.
+
+    Inputs and targets are normalised; all public methods speak raw units. The ensemble's mean
+    is the :math:`\hat f_\theta` on which the L1 controller is built (arXiv 2403.14860,
+    section 3.2), and :meth:`value_and_jacobian` gives it together with its derivative with
+    respect to the action in one pass.
+
+    Args:
+        observation_dim: number of observations, n.
+        action_dim: number of actions, m.
+        members: number of networks, E.
+        hidden: widths of the hidden layers.
+        activation: ``"relu"``, ``"tanh"`` or ``"silu"``.
+        std_floor: smallest standard deviation of the normalisers, in raw units.
+        box_margin: widening of the box around the data, see :class:`DataBox`.
+
+    Examples:
+        >>> import torch
+        >>> model = EnsembleDynamics(4, 1, members=3, hidden=(16,))
+        >>> change, jacobian = model.value_and_jacobian(torch.zeros(7, 4), torch.zeros(7, 1))
+        >>> change.shape, jacobian.shape
+        (torch.Size([7, 4]), torch.Size([7, 4, 1]))
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        members: int = 5,
+        hidden: Sequence[int] = (256, 256),
+        activation: ActivationName = "relu",
+        std_floor: float = 1e-4,
+        box_margin: float = 0.5,
+    ) -> None:
+        super().__init__()
+        self.observation_dim = observation_dim
+        self.action_dim = action_dim
+        self.head = DeterministicHead()
+        self.network = EnsembleMLP(
+            observation_dim + action_dim,
+            self.head.out_features(observation_dim),
+            hidden,
+            members,
+            activation,
+        )
+        self.observation_normalizer = Normalizer(observation_dim, std_floor)
+        self.action_normalizer = Normalizer(action_dim, std_floor)
+        self.change_normalizer = Normalizer(observation_dim, std_floor)
+        self.box = DataBox(observation_dim, box_margin)
+
+    @property
+    def members(self) -> int:
+        """Number of networks in the ensemble."""
+        return self.network.members
+
+    def fit_statistics(self, observation: Tensor, action: Tensor, change: Tensor) -> None:
+        """Set the normalisers and the data box from samples ``(N, n)``, ``(N, m)``, ``(N, n)``."""
+        self.observation_normalizer.fit(observation)
+        self.action_normalizer.fit(action)
+        self.change_normalizer.fit(change)
+        self.box.fit(observation)
+
+    def normalize_inputs(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Network inputs ``(..., n + m)`` from raw observations and actions."""
+        if observation.shape[-1] != self.observation_dim or action.shape[-1] != self.action_dim:
+            raise ValueError(
+                f"the model takes observations of width {self.observation_dim} and actions of "
+                f"width {self.action_dim}, got {observation.shape[-1]} and {action.shape[-1]}"
+            )
+        return torch.cat(
+            [
+                self.observation_normalizer.normalize(observation),
+                self.action_normalizer.normalize(action),
+            ],
+            dim=-1,
+        )
+
+    def member_changes(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Predicted change of every member: ``(..., n)`` and ``(..., m)`` to ``(E, ..., n)``."""
+        inputs = self.normalize_inputs(observation, action)
+        raw = self.network(inputs.reshape(-1, inputs.shape[-1]))[..., : self.observation_dim]
+        changes = self.change_normalizer.denormalize(raw)
+        return changes.reshape(self.members, *observation.shape)
+
+    def member_change(self, observation: Tensor, action: Tensor, member: int) -> Tensor:
+        """Predicted change of one member: ``(B, n)`` and ``(B, m)`` to ``(B, n)``."""
+        inputs = self.normalize_inputs(observation, action)
+        raw = self.network.forward_member(inputs, member)[..., : self.observation_dim]
+        return self.change_normalizer.denormalize(raw)
+
+    def mean_change(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Mean predicted change of the ensemble: ``(..., n)`` and ``(..., m)`` to ``(..., n)``."""
+        return self.member_changes(observation, action).mean(0)
+
+    forward = mean_change
+
+    def value_and_jacobian(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        r"""Mean predicted change and its derivative with respect to the action, in raw units.
+
+        The chain rule through the normalisers is :math:`J = D_{\Delta x} J' D_{u}^{-1}` with
+        the floored standard deviations (arXiv 2403.14860, eq. 22).
+
+        Returns:
+            change ``(..., n)`` and Jacobian ``(..., n, m)``.
+        """
+        inputs = self.normalize_inputs(observation, action)
+        n, m = self.observation_dim, self.action_dim
+        value, tangent = self.network.value_and_directional_derivatives(
+            inputs.reshape(-1, n + m), n, n + m
+        )
+        change = self.change_normalizer.denormalize(value.mean(0)[:, :n])
+        jacobian = tangent.mean(0)[..., :n].transpose(-2, -1)
+        scale = self.change_normalizer.std[:, None] / self.action_normalizer.std
+        return (
+            change.reshape(observation.shape),
+            (jacobian * scale).reshape(*observation.shape, m),
+        )

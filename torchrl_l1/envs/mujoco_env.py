@@ -1,0 +1,209 @@
+"""The benchmark tasks as one batched TorchRL environment."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from .simulator import MAX_MAGNITUDE, BatchedSimulator
+from .tasks import Task, get_task
+
+__all__ = ["BatchedMujocoEnv"]
+
+
+class BatchedMujocoEnv(EnvBase):
+    """A MuJoCo benchmark task with ``num_envs`` environments in one process.
+
+    The physics is Gymnasium's to the bit (the same XML, the same ``mj_step`` over persistent
+    ``MjData``); observations, rewards, resets and termination come from the :class:`Task`.
+    Environments reset independently through the usual ``"_reset"`` mask.
+
+    Reward and termination are evaluated in float64 on the clean state and on the action that this
+    environment receives (noise and disturbances upstream included, before MuJoCo's clamping).
+
+    If the simulation of one environment turns bad (not finite, or beyond 1e10), that step has
+    ``("next", "non_finite")`` and ``("next", "terminated")`` set, its next observation repeats the
+    last good one and its reward is finite. Count these steps, and keep them out of a dynamics
+    model's data: the transition that they show did not happen.
+
+    Args:
+        task: a key of :data:`~torchrl_l1.envs.TASKS`, or a :class:`~torchrl_l1.envs.Task`.
+        num_envs: number of environments ``N``; the batch size is ``[N]``.
+
+    Keyword Args:
+        seed: seed of the resets; drawn from torch's global generator if ``None``.
+        max_steps: steps after which an episode is truncated; the task's horizon if ``None``.
+        dtype: floating dtype of observation, action and reward.
+        threads: threads that share the physics; the results do not depend on it. A second one
+            pays for half_cheetah, hardly for inverted_pendulum.
+
+    Raises:
+        KeyError: if the task is unknown.
+        ValueError: if ``num_envs``, ``max_steps`` or ``threads`` is not positive.
+
+    Examples:
+        >>> env = BatchedMujocoEnv("inverted_pendulum", num_envs=3, seed=0)
+        >>> rollout = env.rollout(100)
+        >>> rollout["next", "reward"].shape
+        torch.Size([3, 100, 1])
+        >>> bool(rollout["next", "truncated"][:, -1].all())
+        True
+    """
+
+    def __init__(
+        self,
+        task: str | Task,
+        num_envs: int = 1,
+        *,
+        seed: int | None = None,
+        max_steps: int | None = None,
+        dtype: torch.dtype = torch.float32,
+        threads: int = 1,
+    ) -> None:
+        task = get_task(task)
+        max_steps = task.horizon if max_steps is None else max_steps
+        counts = {"num_envs": num_envs, "max_steps": max_steps, "threads": threads}
+        for name, value in counts.items():
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}.")
+        super().__init__(device="cpu", batch_size=[num_envs])
+        self.task = task
+        self.num_envs = num_envs
+        self.max_steps = max_steps
+        self._dtype = dtype
+        self._simulator = BatchedSimulator(task, num_envs, threads)
+        data = mujoco.MjData(self.model)
+        self._initial = (data.qpos.copy(), data.qvel.copy())
+        self._steps = np.zeros(num_envs, dtype=np.int64)
+        self._observation = self._observe()
+        self._make_specs()
+        self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
+
+    def _make_specs(self) -> None:
+        batch, task, dtype = self.batch_size, self.task, self._dtype
+        self.observation_spec = Composite(
+            observation=Unbounded((*batch, task.observation_dim), dtype=dtype),
+            non_finite=Binary(shape=(*batch, 1), dtype=torch.bool),
+            shape=batch,
+        )
+        self.action_spec = Bounded(
+            task.action_low, task.action_high, (*batch, task.action_dim), dtype=dtype
+        )
+        self.reward_spec = Unbounded((*batch, 1), dtype=dtype)
+        self.full_done_spec = Composite(
+            {
+                key: Binary(shape=(*batch, 1), dtype=torch.bool)
+                for key in ("done", "terminated", "truncated")
+            },
+            shape=batch,
+        )
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The compiled MuJoCo model, shared by all environments."""
+        return self._simulator.model
+
+    def simulator_state(self) -> tuple[np.ndarray, np.ndarray]:
+        """Current simulator states.
+
+        Returns:
+            Copies of ``qpos (N, nq)`` and ``qvel (N, nv)``, float64.
+        """
+        return self._simulator.qpos.copy(), self._simulator.qvel.copy()
+
+    def set_simulator_state(self, qpos: np.ndarray, qvel: np.ndarray) -> Tensor:
+        """Starts a new episode in every environment from a given simulator state.
+
+        For comparisons and rendering. Transforms are not told: those that keep a state of their
+        own (a step counter, a controller) need an ordinary reset first.
+
+        Args:
+            qpos: positions ``(N, nq)``.
+            qvel: velocities ``(N, nv)``.
+
+        Returns:
+            The observation ``(N, n)`` of these states.
+
+        Raises:
+            ValueError: if a shape is wrong or a number is not finite.
+        """
+        self._simulator.set_state(qpos, qvel)
+        self._steps[:] = 0
+        self._observation = self._observe()
+        return self._emitted()
+
+    def _observe(self) -> Tensor:
+        return torch.from_numpy(self.task.observe(self._simulator.qpos, self._simulator.qvel))
+
+    def _emitted(self) -> Tensor:
+        # A copy even in float64: in-place edits downstream must not reach the clean state.
+        return self._observation.to(self._dtype, copy=True)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._rng = np.random.default_rng(seed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            indices = np.arange(self.num_envs)
+        else:
+            indices = np.flatnonzero(mask.reshape(self.num_envs, -1).any(-1).numpy())
+        if indices.size:
+            qpos, qvel = self.task.sample_reset(self._rng, *self._initial, indices.size)
+            self._simulator.set_state(qpos, qvel, indices)
+            self._steps[indices] = 0
+            self._observation = self._observe()
+        # Environments outside the mask keep their own entries: TorchRL merges by the mask.
+        flag = torch.zeros(self.num_envs, 1, dtype=torch.bool)
+        return TensorDict(
+            {
+                "observation": self._emitted(),
+                "non_finite": flag,
+                "done": flag.clone(),
+                "terminated": flag.clone(),
+                "truncated": flag.clone(),
+            },
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        action = self._checked(tensordict.get("action"))
+        bad = torch.from_numpy(self._simulator.step(action.numpy()))
+        previous, self._observation = self._observation, self._observe()
+        self._steps += 1
+        reward = self.task.reward(previous, action, self._observation)
+        terminated = (self.task.terminated(self._observation) | bad).unsqueeze(-1)
+        truncated = torch.from_numpy(self._steps >= self.max_steps).unsqueeze(-1)
+        return TensorDict(
+            {
+                "observation": self._emitted(),
+                "non_finite": bad.unsqueeze(-1),
+                "reward": reward.unsqueeze(-1).to(self._dtype),
+                "done": terminated | truncated,
+                "terminated": terminated,
+                "truncated": truncated,
+            },
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+
+    def _checked(self, action: Tensor) -> Tensor:
+        expected = (self.num_envs, self.task.action_dim)
+        if tuple(action.shape) != expected:
+            raise ValueError(f"'action' has shape {tuple(action.shape)}, expected {expected}.")
+        action = action.detach().to(torch.float64)
+        magnitude = np.abs(action.numpy())
+        # Written so that NaN fails too; MuJoCo would replace such an input by zero.
+        if not magnitude.max() <= MAX_MAGNITUDE:
+            index = int(np.flatnonzero(~(magnitude <= MAX_MAGNITUDE).all(1))[0])
+            raise ValueError(
+                f"'action' of environment {index} is {action[index].tolist()}: every entry must "
+                f"be finite and at most {MAX_MAGNITUDE:g} in magnitude. Check the policy's output."
+            )
+        return action

@@ -1,0 +1,1 @@
+"""Running recipes: schema, run directories, logging, evaluation, verification."""

@@ -1,0 +1,172 @@
+"""Evaluating frozen policies: L1 off and on, under noise and disturbances."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import OmegaConf
+from tqdm import tqdm
+
+from torchrl_l1.algorithms.collection import Collection, Perturbation
+from torchrl_l1.algorithms.metrpo import METRPO
+from torchrl_l1.experiment.recipes import shared_dir
+from torchrl_l1.experiment.run import build
+from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
+from torchrl_l1.experiment.schema import L1Settings, METRPORecipe, l1_config
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One cell: which controller, which noise, which disturbance, which kind of policy."""
+
+    l1: str
+    noise: str
+    bias: float
+    gain: float
+    policy: str
+
+
+@dataclass
+class TrainedRun:
+    """A finished or running training, loaded for evaluation."""
+
+    path: Path
+    recipe: METRPORecipe
+    algorithm: METRPO
+
+
+def load_run(path: str | Path) -> TrainedRun:
+    """Load recipe, model and policy of a run directory.
+
+    Raises:
+        RunDirectoryError: if the directory holds no run, or no checkpoint yet.
+    """
+    directory = RunDirectory(path)
+    if not directory.config_file.exists():
+        raise RunDirectoryError(f"{path} holds no run: there is no {directory.config_file.name}")
+    checkpoint = directory.load_checkpoint()
+    if checkpoint is None:
+        raise RunDirectoryError(f"the run in {path} has no checkpoint yet; let it finish first")
+    stored = OmegaConf.load(directory.config_file)
+    recipe = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(METRPORecipe), stored))
+    assert isinstance(recipe, METRPORecipe)
+    algorithm = build(replace(recipe, device="cpu"))
+    algorithm.load_state_dict({**checkpoint["algorithm"], "buffer": {}})
+    return TrainedRun(directory.path, recipe, algorithm)
+
+
+def group_setting(group: str, name: str) -> dict[str, Any]:
+    """The values of a shared recipe group's option, such as ``l1`` and ``paper``.
+
+    Raises:
+        ValueError: if the option does not exist; the message lists those that do.
+    """
+    file = shared_dir() / group / f"{name}.yaml"
+    if not file.exists():
+        options = ", ".join(sorted(f.stem for f in file.parent.glob("*.yaml")))
+        raise ValueError(f"unknown {group} setting {name!r}; there are {options}")
+    values = OmegaConf.to_container(OmegaConf.load(file))
+    assert isinstance(values, dict)
+    return {str(key): value for key, value in values.items()}
+
+
+def conditions(
+    l1: Sequence[str],
+    noise: Sequence[str],
+    bias: Sequence[float],
+    gain: Sequence[float],
+    policy: Sequence[str],
+) -> list[Condition]:
+    """Every combination of controller, noise and policy with each bias and, apart, each gain."""
+    disturbances = [(b, 1.0) for b in bias] + [(0.0, g) for g in gain if g != 1.0]
+    cells = product(policy, noise, dict.fromkeys(disturbances), l1)
+    return [Condition(on, n, b, g, p) for p, n, (b, g), on in cells]
+
+
+def evaluate(
+    trained: TrainedRun,
+    cells: Sequence[Condition],
+    episodes: int,
+    seed: int = 0,
+    epsilon: float | None = None,
+) -> Iterator[dict[str, Any]]:
+    """Returns of a frozen policy, one row per condition.
+
+    Every condition sees the same resets and the same random numbers. Model and policy are
+    those of the run's last checkpoint.
+    """
+    for cell in cells:
+        torch.manual_seed(seed)
+        collection = make_collection(trained, cell, episodes, epsilon)
+        data = collection.evaluate(seed, deterministic=cell.policy == "deterministic")
+        yield {
+            "run": str(trained.path),
+            "training_seed": trained.recipe.seed,
+            **vars(cell),
+            **collection.metrics(data),
+        }
+
+
+def make_collection(
+    trained: TrainedRun, cell: Condition, episodes: int, epsilon: float | None = None
+) -> Collection:
+    """The environments of one condition around the frozen policy and model."""
+    settings = L1Settings(**group_setting("l1", cell.l1))
+    settings.epsilon = trained.recipe.l1.epsilon if epsilon is None else epsilon
+    perturbation = Perturbation(
+        **group_setting("noise", cell.noise), actuator_bias=cell.bias, actuator_gain=cell.gain
+    )
+    return Collection(
+        trained.algorithm.task,
+        episodes,
+        trained.algorithm.collection.policy,
+        trained.algorithm.acting_dynamics,
+        l1_config(settings, trained.recipe.task),
+        perturbation,
+        trained.recipe.horizon,
+    )
+
+
+def evaluate_command(options: argparse.Namespace) -> None:
+    """``torchrl-l1 evaluate``: table on the screen, CSV, PNG and, if asked, a filmstrip."""
+    # Plotting takes a second to import; errors in the request should not wait for it.
+    cells = conditions(options.l1, options.noise, options.bias, options.gain, options.policy)
+    for name in options.l1:
+        group_setting("l1", name)
+    for name in options.noise:
+        group_setting("noise", name)
+    if options.episodes < 1:
+        raise ValueError(f"--episodes must be positive, got {options.episodes}")
+    runs = [load_run(path) for path in options.run_dir]
+    tasks = {trained.recipe.task for trained in runs}
+    if len(tasks) > 1:
+        raise ValueError(f"the runs are of different tasks: {', '.join(sorted(tasks))}")
+    output = Path(options.output) if options.output else runs[0].path / "evaluation"
+    rows = []
+    with tqdm(total=len(runs) * len(cells), desc="evaluate", unit="cell") as progress:
+        for trained in runs:
+            for row in evaluate(trained, cells, options.episodes, options.seed, options.epsilon):
+                rows.append(row)
+                progress.update()
+
+    from torchrl_l1.experiment.robustness import plot_robustness, summarize, table
+
+    output.mkdir(parents=True, exist_ok=True)
+    summary = summarize(rows)
+    print(table(summary))
+    RunDirectory(output).write_table(output / "evaluation.csv", rows)
+    RunDirectory(output).write_table(output / "summary.csv", summary)
+    plot_robustness(summary, output / "robustness.png", title=runs[0].recipe.recipe)
+    print(f"Table: {output / 'evaluation.csv'}, {output / 'summary.csv'}")
+    print(f"Plot: {output / 'robustness.png'}")
+    if options.filmstrip:
+        from torchrl_l1.experiment.filmstrip import write_filmstrip
+
+        worst = max(options.bias, key=abs)
+        write_filmstrip(runs[0], options.l1, worst, options.seed, output, options.epsilon)

@@ -1,0 +1,118 @@
+"""Summary, table and plot of an evaluation over disturbances."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+
+_CELL = ("policy", "noise", "bias", "gain", "l1")
+
+
+def summarize(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Median, lowest and highest mean return over the training seeds, per condition."""
+    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[key] for key in _CELL), []).append(row)
+    summary = []
+    for cell, members in groups.items():
+        returns = [float(row["return_mean"]) for row in members]
+        entry = {
+            **dict(zip(_CELL, cell, strict=True)),
+            "training_seeds": len(members),
+            "episodes_per_seed": members[0]["episodes"],
+            "return_median": median(returns),
+            "return_lowest": min(returns),
+            "return_highest": max(returns),
+        }
+        if "l1/switch_rate" in members[0]:
+            rates = [float(row["l1/switch_rate"]) for row in members]
+            entry["switches_per_1000_steps"] = 1000 * median(rates)
+        summary.append(entry)
+    return summary
+
+
+def table(summary: Sequence[Mapping[str, Any]]) -> str:
+    """The summary as text: one line per disturbance, one column per controller."""
+    controllers = list(dict.fromkeys(row["l1"] for row in summary))
+    width = 34
+    lines = []
+    keys = dict.fromkeys((r["policy"], r["noise"], r["bias"], r["gain"]) for r in summary)
+    heading = None
+    for policy, noise, bias, gain in keys:
+        if heading != (policy, noise):
+            heading = (policy, noise)
+            seeds = summary[0]["training_seeds"]
+            lines.append(
+                f"\n{policy} policy, noise {noise}: mean return, "
+                f"median [lowest, highest] of {seeds} training seed{'s' * (seeds > 1)}"
+            )
+            lines.append(f"{'bias':>7}{'gain':>7}" + "".join(f"{c:>{width}}" for c in controllers))
+        cells = ""
+        for controller in controllers:
+            row = next(
+                r
+                for r in summary
+                if (r["policy"], r["noise"], r["bias"], r["gain"], r["l1"])
+                == (policy, noise, bias, gain, controller)
+            )
+            spread = f"[{row['return_lowest']:.4g}, {row['return_highest']:.4g}]"
+            cells += f"{row['return_median']:>{width - 23}.4g} {spread:>22}"
+        lines.append(f"{bias:>7g}{gain:>7g}{cells}")
+    return "\n".join(lines)
+
+
+def plot_robustness(summary: Sequence[Mapping[str, Any]], file: Path, title: str) -> None:
+    """Return against actuator bias and against gain, one line per controller.
+
+    A panel per kind of disturbance and per policy and noise; the band spans the training seeds.
+    """
+    panels = []
+    for policy, noise in dict.fromkeys((r["policy"], r["noise"]) for r in summary):
+        rows = [r for r in summary if (r["policy"], r["noise"]) == (policy, noise)]
+        for axis_name, other, neutral in (("bias", "gain", 1.0), ("gain", "bias", 0.0)):
+            chosen = [r for r in rows if r[other] == neutral]
+            if len({r[axis_name] for r in chosen}) > 1 or (axis_name == "bias" and chosen):
+                panels.append((f"{policy} policy, noise: {noise}", axis_name, chosen))
+    figure, axes = plt.subplots(
+        1, len(panels), figsize=(5.2 * len(panels), 4.2), squeeze=False, constrained_layout=True
+    )
+    for axis, (heading, disturbance, rows) in zip(axes[0], panels, strict=True):
+        _draw_panel(axis, heading, disturbance, rows)
+    figure.suptitle(title)
+    figure.savefig(file, dpi=130)
+    plt.close(figure)
+
+
+def _draw_panel(
+    axis: Axes, heading: str, disturbance: str, rows: Sequence[Mapping[str, Any]]
+) -> None:
+    for controller in dict.fromkeys(r["l1"] for r in rows):
+        line = sorted((r for r in rows if r["l1"] == controller), key=lambda r: r[disturbance])
+        x = [r[disturbance] for r in line]
+        label = "L1 off" if controller == "off" else f"L1 {controller}"
+        (drawn,) = axis.plot(x, [r["return_median"] for r in line], "o-", label=label)
+        axis.fill_between(
+            x,
+            [r["return_lowest"] for r in line],
+            [r["return_highest"] for r in line],
+            alpha=0.2,
+            color=drawn.get_color(),
+            linewidth=0,
+        )
+    lowest = min(r["return_lowest"] for r in rows)
+    if max(r["return_highest"] for r in rows) <= 0 and lowest < -5:
+        axis.set_yscale("symlog", linthresh=1)
+    units = "action units" if disturbance == "bias" else "factor"
+    axis.set_xlabel(f"actuator {disturbance} ({units})")
+    axis.set_ylabel("return")
+    axis.set_title(heading, fontsize=10)
+    axis.grid(alpha=0.3)
+    axis.legend()

@@ -1,0 +1,115 @@
+"""Running a recipe: from a resolved configuration to a finished run directory."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from torchrl_l1.algorithms import METRPO
+from torchrl_l1.experiment.run_directory import RunDirectory, save_atomically, versions
+from torchrl_l1.experiment.schema import METRPORecipe, algorithm_config, l1_config
+from torchrl_l1.experiment.tracking import Tracker, check_mode
+
+
+def run(config: DictConfig) -> Path:
+    """Run or resume a recipe.
+
+    Args:
+        config: composed by Hydra from a recipe.
+
+    Returns:
+        the run directory.
+
+    Raises:
+        RunDirectoryError: if the run directory holds another run.
+        ValueError: if settings contradict each other; nothing has been written then.
+    """
+    resolved = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    assert isinstance(resolved, dict)
+    recipe = OmegaConf.to_object(config)
+    assert isinstance(recipe, METRPORecipe)
+    settings = {str(key): value for key, value in resolved.items()}
+    check_mode(recipe.wandb.mode)
+    torch.set_num_threads(recipe.threads)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    progress = tqdm(
+        total=recipe.outer_iterations,
+        desc=f"{recipe.recipe} seed {recipe.seed}",
+        unit="iteration",
+        disable=None,
+    )
+    with progress:
+        algorithm = build(recipe)
+        algorithm.on_phase = lambda phase: progress.set_postfix_str(phase)
+        directory = RunDirectory(recipe.run_dir)
+        directory.open(settings, recipe.resume)
+        _run(algorithm, recipe, settings, directory, progress)
+    print(f"Finished: {directory.metrics_file}")
+    return directory.path
+
+
+def build(recipe: METRPORecipe) -> METRPO:
+    """The algorithm that a recipe describes, fresh."""
+    return METRPO(
+        recipe.task,
+        algorithm_config(recipe),
+        l1=l1_config(recipe.l1, recipe.task),
+        perturbation=recipe.perturbation,
+        seed=recipe.seed,
+        horizon=recipe.horizon,
+        device=recipe.device,
+    )
+
+
+def _run(
+    algorithm: METRPO,
+    recipe: METRPORecipe,
+    settings: dict[str, Any],
+    directory: RunDirectory,
+    progress: tqdm,
+) -> None:
+    rows: list[dict[str, Any]] = []
+    timings: list[dict[str, Any]] = []
+    checkpoint = directory.load_checkpoint()
+    if checkpoint is not None:
+        algorithm.load_state_dict(checkpoint["algorithm"])
+        rows, timings = checkpoint["metrics"], checkpoint["timings"]
+        progress.update(len(rows))
+        directory.write_table(directory.metrics_file, rows)
+        directory.write_table(directory.timing_file, timings)
+        if len(rows) >= recipe.outer_iterations:
+            progress.write(f"{directory.path} is complete: nothing to do")
+            return
+    run_id = hashlib.sha256(str(directory.path.resolve()).encode()).hexdigest()[:12]
+    tracker = Tracker(
+        recipe.wandb.mode,
+        recipe.wandb.project,
+        {**settings, "versions": versions()},
+        directory.path,
+        run_id,
+    )
+    for result in algorithm.iterate():
+        rows.append(result.metrics)
+        timings.append({"iteration": result.metrics["iteration"], **result.seconds})
+        directory.save_checkpoint(
+            {"algorithm": algorithm.state_dict(), "metrics": rows, "timings": timings}
+        )
+        directory.write_table(directory.metrics_file, rows)
+        directory.write_table(directory.timing_file, timings)
+        save_atomically(directory.path / "model.pt", algorithm.dynamics.state_dict())
+        save_atomically(directory.path / "policy.pt", algorithm.policy.state_dict())
+        seconds = {f"seconds/{phase}": value for phase, value in result.seconds.items()}
+        tracker.log({**result.metrics, **seconds}, step=len(rows) - 1)
+        progress.update()
+        progress.write(
+            f"iteration {len(rows) - 1}: {result.metrics['real_steps']} real steps, "
+            f"return {result.metrics['return_mean']:.2f} "
+            f"(deterministic {result.metrics['return_deterministic']:.2f})"
+        )
+    tracker.finish()

@@ -1,0 +1,155 @@
+"""The directory of a run: what is written, how, and how a run is found again."""
+
+from __future__ import annotations
+
+import csv
+import fcntl
+import io
+import json
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import OmegaConf
+
+from torchrl_l1.experiment.schema import VOLATILE_KEYS
+
+PACKAGES = ("torchrl-l1", "torch", "tensordict", "torchrl", "gymnasium", "mujoco", "numpy")
+
+
+class RunDirectoryError(Exception):
+    """The run directory cannot be used as asked; the message says why and what to do."""
+
+
+class RunDirectory:
+    """Files of one run.
+
+    ``config.yaml`` (resolved), ``versions.json``, ``metrics.csv`` (one row per outer iteration,
+    the source of truth), ``timing.csv`` (wall-clock seconds by phase), ``checkpoint.pt``,
+    ``model.pt``, ``policy.pt``, and W&B's own files. All but the CSVs are replaced atomically;
+    the CSVs are rewritten from the checkpoint's rows when a run resumes.
+
+    Args:
+        path: the directory.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.config_file = self.path / "config.yaml"
+        self.checkpoint_file = self.path / "checkpoint.pt"
+        self.metrics_file = self.path / "metrics.csv"
+        self.timing_file = self.path / "timing.csv"
+
+    def open(self, config: dict[str, Any], resume: bool) -> None:
+        """Prepare the directory for a run of ``config`` and take hold of it.
+
+        Raises:
+            RunDirectoryError: if it holds a run and ``resume`` is not set, if that run has
+                another configuration, or if another process is running in it. Nothing is
+                changed in these cases.
+        """
+        if self.config_file.exists():
+            if not resume:
+                raise RunDirectoryError(
+                    f"{self.path} already holds a run. Continue it with --resume, or choose "
+                    "another directory with run_dir=..."
+                )
+            self._check_same(config)
+        elif self.path.exists() and any(self.path.iterdir()):
+            raise RunDirectoryError(
+                f"{self.path} is not empty and holds no run; choose another run_dir"
+            )
+        self.path.mkdir(parents=True, exist_ok=True)
+        self._lock()
+        if not self.config_file.exists():
+            write_atomically(self.path / "versions.json", json.dumps(versions(), indent=2))
+            write_atomically(self.config_file, OmegaConf.to_yaml(OmegaConf.create(config)))
+
+    def _check_same(self, config: dict[str, Any]) -> None:
+        stored = OmegaConf.to_container(OmegaConf.load(self.config_file))
+        assert isinstance(stored, dict)
+        before, now = _flatten(stored), _flatten(config)
+        different = [
+            f"{key}: {before.get(key, '(absent)')} there, {now.get(key, '(absent)')} now"
+            for key in sorted(before.keys() | now.keys())
+            if before.get(key) != now.get(key) and key.split(".")[0] not in VOLATILE_KEYS
+        ]
+        if different:
+            raise RunDirectoryError(
+                f"{self.path} holds a run of another configuration:\n  "
+                + "\n  ".join(different)
+                + "\nGive the same settings, or another run_dir."
+            )
+
+    def _lock(self) -> None:
+        self._lock_handle = (self.path / ".lock").open("w")
+        try:
+            fcntl.flock(self._lock_handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise RunDirectoryError(f"another process is running in {self.path}") from error
+
+    def save_checkpoint(self, state: dict[str, Any]) -> None:
+        """Replace the checkpoint; a kill at any moment leaves the old or the new one."""
+        save_atomically(self.checkpoint_file, state)
+
+    def load_checkpoint(self) -> dict[str, Any] | None:
+        """The last checkpoint, or ``None`` if there is none yet."""
+        if not self.checkpoint_file.exists():
+            return None
+        state: dict[str, Any] = torch.load(
+            self.checkpoint_file, weights_only=True, map_location="cpu"
+        )
+        return state
+
+    def write_table(self, file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Write a whole CSV atomically; columns in order of first appearance."""
+        columns = list(dict.fromkeys(key for row in rows for key in row))
+        text = io.StringIO()
+        writer = csv.DictWriter(text, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        write_atomically(file, text.getvalue())
+
+
+def _flatten(node: Any, prefix: str = "") -> dict[str, Any]:
+    if not isinstance(node, dict):
+        return {prefix: node}
+    flat: dict[str, Any] = {}
+    for key, value in node.items():
+        flat.update(_flatten(value, f"{prefix}.{key}" if prefix else str(key)))
+    return flat
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, the platform and the packages that a result depends on."""
+    found = {"python": platform.python_version(), "platform": platform.platform()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def write_atomically(file: Path, text: str) -> None:
+    """Replace a text file in one step."""
+    temporary = file.with_name(file.name + ".tmp")
+    with temporary.open("w", encoding="utf-8") as handle:
+        handle.write(text)
+        handle.flush()
+        os.fsync(handle.fileno())
+    os.replace(temporary, file)
+
+
+def save_atomically(file: Path, state: object) -> None:
+    """Replace a ``torch.save`` file in one step."""
+    temporary = file.with_name(file.name + ".tmp")
+    with temporary.open("wb") as handle:
+        torch.save(state, handle)
+        handle.flush()
+        os.fsync(handle.fileno())
+    os.replace(temporary, file)

@@ -1,0 +1,126 @@
+"""What a recipe may contain: the typed schema behind the YAML files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING
+
+from torchrl_l1.algorithms import METRPOConfig, Perturbation
+from torchrl_l1.control import L1Config
+from torchrl_l1.envs import get_task
+
+
+@dataclass
+class L1Settings:
+    """The adaptive controller of a recipe.
+
+    Attributes:
+        enabled: whether L1 acts during collection.
+        epsilon: tolerance of the switching law, raw state units.
+        alpha: smoothing factor of the low-pass filter per step; or give ``cutoff``.
+        cutoff: cutoff frequency of the low-pass filter, rad/s.
+        a_s: diagonal of the predictor's Hurwitz matrix, 1/s.
+        on_switch: ``keep`` or ``reset`` predictor and filter at a switch.
+        switch_on: the switching law looks at the ``policy`` action or the ``executed`` input.
+        filter_input: the filter takes the ``current`` or the ``previous`` estimate.
+    """
+
+    enabled: bool = False
+    epsilon: float = 1.0
+    alpha: float | None = None
+    cutoff: float | None = None
+    a_s: float = -1.0
+    on_switch: str = "keep"
+    switch_on: str = "executed"
+    filter_input: str = "previous"
+
+
+@dataclass
+class WandbSettings:
+    """Logging to Weights & Biases.
+
+    Attributes:
+        mode: ``auto`` (online when logged in, else offline), ``online``, ``offline``,
+            ``disabled``.
+        project: name of the project.
+    """
+
+    mode: str = "auto"
+    project: str = "torchrl_l1"
+
+
+@dataclass
+class RunSettings:
+    """Settings of every recipe, whatever the algorithm.
+
+    Attributes:
+        recipe: the recipe's name, as given on the command line.
+        task: a task of :data:`torchrl_l1.envs.TASKS`.
+        seed: seed of every random stream.
+        run_dir: where the run's files go.
+        resume: continue the run in ``run_dir`` from its last checkpoint.
+        threads: CPU threads of torch.
+        device: ``cpu``, ``cuda`` or ``auto`` (CUDA where there is one).
+        horizon: steps per real episode; the task's own if null.
+        published_horizon: imagined horizon of the published runs, for ``preset=paper``.
+        l1: see :class:`L1Settings`.
+        perturbation: noise and disturbances of the real environment.
+        wandb: see :class:`WandbSettings`.
+    """
+
+    recipe: str = MISSING
+    task: str = MISSING
+    seed: int = 0
+    run_dir: str = "runs/${recipe}/${hydra:job.override_dirname}/seed_${seed}"
+    resume: bool = False
+    threads: int = 1
+    device: str = "cpu"
+    horizon: int | None = None
+    published_horizon: int = 1000
+    l1: L1Settings = field(default_factory=L1Settings)
+    perturbation: Perturbation = field(default_factory=Perturbation)
+    wandb: WandbSettings = field(default_factory=WandbSettings)
+
+
+@dataclass
+class METRPORecipe(RunSettings, METRPOConfig):
+    """A METRPO recipe: run settings and the algorithm's own, side by side."""
+
+
+# Keys that may differ between a run and its continuation: they do not touch the result.
+VOLATILE_KEYS = ("run_dir", "resume", "wandb", "threads")
+
+
+def register() -> None:
+    """Make the schemas known to Hydra."""
+    ConfigStore.instance().store(name="metrpo_recipe", node=METRPORecipe)
+
+
+def algorithm_config(recipe: METRPORecipe) -> METRPOConfig:
+    """The algorithm's part of a recipe."""
+    return METRPOConfig(**{f.name: getattr(recipe, f.name) for f in fields(METRPOConfig)})
+
+
+def l1_config(settings: L1Settings, task_name: str) -> L1Config | None:
+    """The controller that a recipe asks for on a task; ``None`` if it is off.
+
+    Raises:
+        ValueError: for settings that contradict each other, see :class:`L1Config`.
+    """
+    if not settings.enabled:
+        return None
+    task = get_task(task_name)
+    return L1Config(
+        dt=task.dt,
+        epsilon=settings.epsilon,
+        alpha=settings.alpha,
+        cutoff=settings.cutoff,
+        a_s=settings.a_s,
+        on_switch=settings.on_switch,  # type: ignore[arg-type]
+        switch_on=settings.switch_on,  # type: ignore[arg-type]
+        filter_input=settings.filter_input,  # type: ignore[arg-type]
+        action_low=task.action_low,
+        action_high=task.action_high,
+    )

@@ -1,0 +1,12 @@
+"""Policy objectives that TorchRL lacks: TRPO and the linear value baseline."""
+
+from torchrl_l1.objectives.linear_baseline import LinearFeatureBaseline
+from torchrl_l1.objectives.trpo import TRPOConfig, TRPOReport, conjugate_gradient, trpo_step
+
+__all__ = [
+    "LinearFeatureBaseline",
+    "TRPOConfig",
+    "TRPOReport",
+    "conjugate_gradient",
+    "trpo_step",
+]
