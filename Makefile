@@ -43,7 +43,7 @@ docs: $(VENV)/.installed-docs ## Build the documentation, warnings are errors
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 	@echo "open docs/_build/html/index.html"
 
-bench: $(VENV)/.installed-bench ## Run all speed tables (about ten quiet minutes)
+bench: $(VENV)/.installed-bench ## Run all speed tables (some minutes on an otherwise idle machine)
 	$(BIN)/python -m benchmarks $(BENCH_ARGS)
 
 wheel: $(VENV)/.installed-base ## Build the wheel into dist/ and check what is in it
@@ -51,7 +51,7 @@ wheel: $(VENV)/.installed-base ## Build the wheel into dist/ and check what is i
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
 	$(BIN)/python .ci/check_wheel.py dist/*.whl
 
-lock: ## Resolve constraints.txt anew (needs a quiet quarter of an hour)
+lock: ## Resolve constraints.txt anew (takes some minutes)
 	.ci/lock $(PYTHON)
 
 clean: ## Remove the environment and everything built
@@ -60,10 +60,12 @@ clean: ## Remove the environment and everything built
 	find . -name __pycache__ -type d -not -path './.git/*' -prune -exec rm -rf {} +
 
 $(BIN)/python:
-	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || { \
-	    echo "error: torchrl_l1 needs Python 3.11 to 3.13, but '$(PYTHON)' is" \
-	        "$$($(PYTHON) --version 2>&1 || true). Try: make PYTHON=python3.11 <target>" >&2; exit 1; }
-	$(PYTHON) -m venv $(VENV)
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' \
+	    2>/dev/null || { \
+	    echo "error: torchrl_l1 needs Python 3.11 to 3.13; '$(PYTHON)' is" \
+	        "$$($(PYTHON) --version 2>/dev/null || echo 'not found')." \
+	        "Name another one: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }
 
 # One stamp for each set of extras: a second call installs nothing.
 $(VENV)/.installed-%: pyproject.toml constraints.txt | $(BIN)/python

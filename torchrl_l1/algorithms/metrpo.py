@@ -11,6 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from dataclasses import dataclass, field
+from itertools import pairwise
+from statistics import fmean
 from time import perf_counter
 from typing import Any
 
@@ -128,6 +130,15 @@ class METRPOConfig:
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     trpo: TRPOConfig = field(default_factory=TRPOConfig)
+
+
+@dataclass
+class PolicyStep:
+    """One TRPO step: its report, and what the trajectories that it learnt from were like."""
+
+    report: TRPOReport
+    imagined_return: float
+    left_box: float
 
 
 @dataclass
@@ -261,10 +272,8 @@ class METRPO:
             }
             self.iteration += 1
             phases = ("random", "fit", "trpo", "collect", "evaluate")
-            spans = zip(clock[:-1], clock[1:], strict=True)
-            yield IterationResult(
-                metrics, {p: b - a for p, (a, b) in zip(phases, spans, strict=True)}
-            )
+            seconds = [after - before for before, after in pairwise(clock)]
+            yield IterationResult(metrics, dict(zip(phases, seconds, strict=True)))
 
     def store(self, data: TensorDictBase) -> None:
         """Add real transitions ``[N, T]``, a fixed share of them marked for validation."""
@@ -276,8 +285,8 @@ class METRPO:
         items["validation"] = torch.rand(items.shape[0]) < self.config.fit.validation_fraction
         self.buffer.extend(items)
 
-    def improve_policy(self) -> tuple[TRPOReport, TensorDict]:
-        """One TRPO step on fresh imagined trajectories."""
+    def improve_policy(self) -> PolicyStep:
+        """One TRPO step on fresh imagined trajectories; the baseline is refitted after it."""
         config = self.config
         trajectories = imagine(
             self.dynamics,
@@ -313,7 +322,12 @@ class METRPO:
         )
         report = trpo_step(self.actor, samples, config.trpo)
         self.baseline.fit(observation[valid], step[valid], target[valid])
-        return report, trajectories
+        rewards = trajectories["next", "reward"] * trajectories["valid"]
+        return PolicyStep(
+            report,
+            imagined_return=rewards.sum(1).mean().item(),
+            left_box=trajectories["next", "terminated"].any(1).float().mean().item(),
+        )
 
     def imagined_starts(self, count: int) -> torch.Tensor:
         """First observations of imagined trajectories ``(count, n)``."""
@@ -370,17 +384,13 @@ def _fit_metrics(fit: FitReport) -> dict[str, float]:
     }
 
 
-def _policy_metrics(steps: list[tuple[TRPOReport, TensorDict]]) -> dict[str, float]:
-    def imagined_return(trajectories: TensorDict) -> float:
-        reward = trajectories["next", "reward"] * trajectories["valid"]
-        return reward.sum(1).mean().item()
-
-    reports = [report for report, _ in steps]
+def _policy_metrics(steps: list[PolicyStep]) -> dict[str, float]:
+    reports = [step.report for step in steps]
     return {
-        "imagined/return_first": imagined_return(steps[0][1]),
-        "imagined/return_last": imagined_return(steps[-1][1]),
-        "imagined/left_box": steps[-1][1]["next", "terminated"].any(1).float().mean().item(),
-        "trpo/kl": sum(r.kl for r in reports) / len(reports),
-        "trpo/improvement": sum(r.improvement for r in reports) / len(reports),
-        "trpo/accepted": sum(r.accepted for r in reports) / len(reports),
+        "imagined/return_first": steps[0].imagined_return,
+        "imagined/return_last": steps[-1].imagined_return,
+        "imagined/left_box": steps[-1].left_box,
+        "trpo/kl": fmean(report.kl for report in reports),
+        "trpo/improvement": fmean(report.improvement for report in reports),
+        "trpo/accepted": fmean(report.accepted for report in reports),
     }

@@ -19,9 +19,9 @@ __all__ = ["BatchedMujocoEnv"]
 class BatchedMujocoEnv(EnvBase):
     """A MuJoCo benchmark task with ``num_envs`` environments in one process.
 
-    The physics is Gymnasium's to the bit (the same XML, the same ``mj_step`` over persistent
-    ``MjData``); observations, rewards, resets and termination come from the :class:`Task`.
-    Environments reset independently through the usual ``"_reset"`` mask.
+    The physics is Gymnasium's to the bit (the same XML and ``mj_step``, the whole integration state
+    kept from step to step); observations, rewards, resets and termination come from the
+    :class:`Task`. Environments reset independently through the usual ``"_reset"`` mask.
 
     Reward and termination are evaluated in float64 on the clean state and on the action that this
     environment receives (noise and disturbances upstream included, before MuJoCo's clamping).
@@ -39,8 +39,8 @@ class BatchedMujocoEnv(EnvBase):
         seed: seed of the resets; drawn from torch's global generator if ``None``.
         max_steps: steps after which an episode is truncated; the task's horizon if ``None``.
         dtype: floating dtype of observation, action and reward.
-        threads: threads that share the physics; the results do not depend on it. A second one
-            pays for half_cheetah, hardly for inverted_pendulum.
+        threads: threads that share the physics; the results do not depend on it. More than one
+            helps only where cores are idle and the physics is the dearest part of a step.
 
     Raises:
         KeyError: if the task is unknown.

@@ -1,4 +1,4 @@
-"""Zero-mean measurement and actuation noise, as in the experiments of arXiv:2403.07862."""
+"""Zero-mean measurement and actuation noise, as in the experiments of arXiv 2403.14860."""
 
 from __future__ import annotations
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import mujoco
 import numpy as np
+from mujoco.batch import Batch
 
 from .tasks import Task
 
@@ -20,13 +20,14 @@ _BAD_STATE = [
     int(mujoco.mjtWarning.mjWARN_BADQVEL),
     int(mujoco.mjtWarning.mjWARN_BADQACC),
 ]
+_NO_STAGE = int(mujoco.mjtStage.mjSTAGE_NONE)
 
 
 class BatchedSimulator:
-    """``num_envs`` persistent :class:`mujoco.MjData` over one :class:`mujoco.MjModel`.
+    """``num_envs`` simulations of one task.
 
-    Every environment keeps its own ``MjData`` from step to step, solver warm start included, so
-    that trajectories are bit-equal to Gymnasium's.
+    Each keeps its whole integration state from step to step, solver warm start included, so that
+    trajectories are bit-equal to Gymnasium's. Copies and pickles continue where the original is.
 
     Args:
         task: the task to simulate.
@@ -35,9 +36,9 @@ class BatchedSimulator:
 
     Attributes:
         model: the compiled MuJoCo model.
-        data: MuJoCo's own record of each environment (contacts, sensors, body poses).
-        qpos: positions ``(N, nq)``, float64.
-        qvel: velocities ``(N, nv)``, float64.
+        batch: MuJoCo's own interface to all simulations (contacts, sensors, body poses, ...).
+        qpos: positions ``(N, nq)``, float64; a live view.
+        qvel: velocities ``(N, nv)``, float64; a live view.
     """
 
     def __init__(self, task: Task, num_envs: int, threads: int = 1) -> None:
@@ -45,27 +46,23 @@ class BatchedSimulator:
         self.num_envs = num_envs
         self.threads = min(threads, num_envs)
         self.model: mujoco.MjModel = task.build_model()
-        self.data = [mujoco.MjData(self.model) for _ in range(num_envs)]
-        self._bind()
-        self.qpos = np.stack(self._qpos_views)
-        self.qvel = np.stack(self._qvel_views)
+        self._start()
 
-    def _bind(self) -> None:
-        # MuJoCo's arrays are views whose look-up through MjData costs more than their use.
-        self._ctrl_views = [data.ctrl for data in self.data]
-        self._qpos_views = [data.qpos for data in self.data]
-        self._qvel_views = [data.qvel for data in self.data]
-        self._warning_views = [data.warning.number for data in self.data]
-        self._pool = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
+    def _start(self) -> None:
+        self.batch = Batch(self.model, self.num_envs, nthread=self.threads)
+        self.qpos: np.ndarray = self.batch.bind("qpos")
+        self.qvel: np.ndarray = self.batch.bind("qvel")
+        self._ctrl: np.ndarray = self.batch.bind("ctrl")
 
     def __getstate__(self) -> dict[str, Any]:
-        # A copied view would no longer be MuJoCo's memory: rebuild the views instead.
-        left_out = ("_views", "_pool")
-        return {k: v for k, v in self.__dict__.items() if not k.endswith(left_out)}
+        kept = ("task", "num_envs", "threads", "model")
+        return {**{k: self.__dict__[k] for k in kept}, "rows": self.batch.state.copy()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
+        rows = state.pop("rows")
         self.__dict__.update(state)
-        self._bind()
+        self._start()
+        self.batch.state[:] = rows
 
     def set_state(
         self, qpos: np.ndarray, qvel: np.ndarray, indices: Sequence[int] | np.ndarray | None = None
@@ -80,7 +77,7 @@ class BatchedSimulator:
         Raises:
             ValueError: if a shape is not the expected one or a number is not finite.
         """
-        chosen = range(self.num_envs) if indices is None else indices
+        chosen = np.arange(self.num_envs) if indices is None else np.asarray(indices)
         for name, value, size in (("qpos", qpos, self.model.nq), ("qvel", qvel, self.model.nv)):
             if np.shape(value) != (len(chosen), size):
                 raise ValueError(
@@ -89,14 +86,10 @@ class BatchedSimulator:
                 )
             if not np.isfinite(value).all():
                 raise ValueError(f"{name} has entries that are not finite.")
-        for row, index in enumerate(chosen):
-            data = self.data[index]
-            mujoco.mj_resetData(self.model, data)
-            data.qpos[:] = qpos[row]
-            data.qvel[:] = qvel[row]
-            mujoco.mj_forward(self.model, data)  # so that contacts and poses are of this state
-            self.qpos[index] = qpos[row]
-            self.qvel[index] = qvel[row]
+        self.batch.reset(chosen, stage=_NO_STAGE)
+        self.qpos[chosen] = qpos
+        self.qvel[chosen] = qvel
+        self.batch.forward(chosen)
 
     def step(self, control: np.ndarray) -> np.ndarray:
         """Advances every environment by one environment step.
@@ -111,36 +104,20 @@ class BatchedSimulator:
         Returns:
             Boolean ``(N,)``: which environments turned bad.
         """
-        if self._pool is None:
-            self._advance(control, 0)
-        else:
-            others = [self._pool.submit(self._advance, control, i) for i in range(1, self.threads)]
-            self._advance(control, 0)
-            for other in others:
-                other.result()
-        shape = (self.num_envs, -1)
-        qpos = np.concatenate(self._qpos_views).reshape(shape)
-        qvel = np.concatenate(self._qvel_views).reshape(shape)
-        warnings = np.concatenate(self._warning_views)
+        batch = self.batch
+        before = batch.state.copy()
+        self._ctrl[:] = control
+        batch.step(nstep=self.task.frame_skip)
         # MuJoCo checks at the start of a step: what the last one produced is unchecked. A maximum
         # is NaN as soon as one entry is, and fails the comparison as well.
-        sound = np.abs(qpos).max() <= MAX_MAGNITUDE and np.abs(qvel).max() <= MAX_MAGNITUDE
-        if not sound or warnings.any():
-            bad = warnings.reshape(shape)[:, _BAD_STATE].any(1)
-            bad |= ~(np.abs(qpos) <= MAX_MAGNITUDE).all(1) | ~(np.abs(qvel) <= MAX_MAGNITUDE).all(1)
-            indices = np.flatnonzero(bad)
-            qpos[indices], qvel[indices] = self.qpos[indices], self.qvel[indices]
-            self.set_state(qpos[indices], qvel[indices], indices)
-        else:
-            bad = np.zeros(self.num_envs, dtype=bool)
-        self.qpos, self.qvel = qpos, qvel
+        sound = np.abs(self.qpos).max() <= MAX_MAGNITUDE >= np.abs(self.qvel).max()
+        if sound and not batch.warning.any():
+            return np.zeros(self.num_envs, dtype=bool)
+        counts = batch.warning[:, _BAD_STATE, 1]  # of (last cause, count)
+        bad: np.ndarray = (counts > 0).any(1)
+        for values in (self.qpos, self.qvel):
+            bad |= ~(np.abs(values) <= MAX_MAGNITUDE).all(1)
+        indices = np.flatnonzero(bad)
+        batch.reset(indices, stage=_NO_STAGE)  # clears the warnings
+        batch.state[indices] = before[indices]
         return bad
-
-    def _advance(self, control: np.ndarray, part: int) -> None:
-        model, frame_skip, mj_step = self.model, self.task.frame_skip, mujoco.mj_step
-        share = slice(part, None, self.threads)
-        for view, row, data in zip(
-            self._ctrl_views[share], control[share], self.data[share], strict=True
-        ):
-            view[:] = row
-            mj_step(model, data, nstep=frame_skip)  # releases the GIL

@@ -149,7 +149,8 @@ def evaluate_command(options: argparse.Namespace) -> None:
         raise ValueError(f"the runs are of different tasks: {', '.join(sorted(tasks))}")
     output = Path(options.output) if options.output else runs[0].path / "evaluation"
     rows = []
-    with tqdm(total=len(runs) * len(cells), desc="evaluate", unit="cell") as progress:
+    total = len(runs) * len(cells)
+    with tqdm(total=total, desc="evaluate", unit="cell", disable=None) as progress:
         for trained in runs:
             for row in evaluate(trained, cells, options.episodes, options.seed, options.epsilon):
                 rows.append(row)

@@ -37,7 +37,7 @@ def write_filmstrip(
     steps = min(task.horizon, round(_SECONDS_SHOWN / task.dt))
     try:
         rows = {
-            f"L1 {name}, bias {bias:g}": rollout_frames(
+            f"L1 {name}": rollout_frames(
                 task, _poses(trained, Condition(name, "none", bias, 1.0, ""), steps, seed, epsilon)
             )
             for name in controllers
@@ -47,7 +47,7 @@ def write_filmstrip(
         return
     strip = filmstrip(rows, output / "filmstrip.png", every=max(1, steps // _COLUMNS), dt=task.dt)
     moving = animation(rows, output / "rollout.gif", dt=task.dt)
-    print(f"Filmstrip: {strip}, animation: {moving}")
+    print(f"Filmstrip at bias {bias:g}: {strip}, animation: {moving}")
 
 
 def _poses(

@@ -31,8 +31,8 @@ class TRPOConfig:
     damping: float = 0.1
     cg_iterations: int = 10
     fisher_fraction: float = 0.1
-    backtrack_ratio: float = 0.5
-    max_backtracks: int = 10
+    backtrack_ratio: float = 0.8
+    max_backtracks: int = 15
     accept_ratio: float = 0.1
 
 
@@ -79,7 +79,7 @@ def trpo_step(
     """Take one TRPO step on ``actor`` in place (arXiv 1502.05477).
 
     The direction is the natural gradient of the importance-weighted surrogate; the step length
-    starts at the trust region's edge and is halved until both the surrogate improves as it
+    starts at the trust region's edge and is shortened until both the surrogate improves as it
     should and the mean KL divergence stays within bounds. If no candidate passes, the
     parameters stay as they were.
 

@@ -1,0 +1,42 @@
+"""Benchmarks measure what they say, in files that can be read back."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from benchmarks import jacobian
+from benchmarks.tables import Table
+from benchmarks.timing import interleave, ratio
+
+
+def test_cases_take_turns() -> None:
+    calls: list[str] = []
+    cases = {name: lambda name=name: calls.append(name) for name in "ab"}
+    measured = interleave(cases, 3, shortest=0.0, warmup=0)
+    # One calibrating call of each, then in turns.
+    assert "".join(calls) == "ab" + "ababab"
+    assert {name: len(values) for name, values in measured.items()} == {"a": 3, "b": 3}
+
+
+def test_ratio_is_taken_between_neighbours() -> None:
+    found = ratio("speed", [1.0, 10.0, 6.0], [1.0, 5.0, 2.0])
+    assert found == {"speed": 2.0, "speed_low": 1.0, "speed_high": 3.0}
+
+
+def test_table_round_trip(tmp_path: Path) -> None:
+    rows = [{"task": "a", "speed": 1234.5, "speed_low": 1000.0, "speed_high": 2000.0, "n": 3}]
+    table = Table("stem", "Title", "Caption", rows, {"task": "Task", "speed": "Speed"}, {})
+    table.write(tmp_path)
+    assert "| a | 1234.50 (1000.00 to 2000.00) |" in (tmp_path / "stem.md").read_text()
+    with (tmp_path / "stem.csv").open() as file:
+        assert list(csv.DictReader(file)) == [{k: str(v) for k, v in rows[0].items()}]
+
+
+def test_jacobian_benchmark_compares_equal_computations(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jacobian, "SIZES", ((2, 3, 2),))
+    (row,) = jacobian.run(1)
+    assert {"forward", "analytic", "jvp", "jacfwd", "jacrev", "forwards"} <= row.keys()
+    assert all(row[f"{rival}_ratio"] > 0 for rival in jacobian.RIVALS)

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from torchrl_l1.control import L1Config
+
+
+def test_presets_are_those_of_the_paper_and_of_the_released_code():
+    paper, reference = L1Config.paper(0.04, epsilon=1.0), L1Config.reference(0.04, epsilon=3.0)
+    assert paper == L1Config(0.04)
+    assert (paper.on_switch, paper.switch_on, paper.filter_input) == (
+        "keep",
+        "executed",
+        "previous",
+    )
+    assert (reference.on_switch, reference.switch_on, reference.filter_input) == (
+        "reset",
+        "policy",
+        "current",
+    )
+    assert reference.epsilon == 3.0
+    assert paper.filter_gain == reference.filter_gain == 0.35
+    assert L1Config.reference(0.04, on_switch="keep").on_switch == "keep"
+
+
+def test_cutoff_and_alpha_are_two_names_of_one_gain():
+    assert L1Config(0.01, cutoff=20.0).filter_gain == pytest.approx(0.2)
+    assert L1Config(0.01, alpha=0.2).filter_gain == 0.2
+    assert L1Config(0.01, cutoff=0.0).filter_gain == 0.0
+
+
+def test_gains_at_the_default_rate():
+    config = L1Config(0.05)
+    kappa = 0.05 / (math.exp(0.05) - 1)
+    assert config.adaptation_gain == pytest.approx(kappa, rel=1e-14)
+    assert config.predictor_gain == pytest.approx(kappa + 0.05, rel=1e-14)
+    assert L1Config(1e-12).adaptation_gain == pytest.approx(1.0, rel=1e-11)
+    assert len(L1Config(0.05, a_s=[-1.0, -2.0]).adaptation_gain) == 2
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"dt": 0.0}, "dt must be a positive"),
+        ({"dt": -0.1}, "dt must be a positive"),
+        ({"dt": float("nan")}, "dt must be a finite"),
+        ({"dt": "0.1"}, "dt must be a finite number, got '0.1'"),
+        ({"epsilon": -1.0}, "epsilon must not be negative"),
+        ({"epsilon": float("inf")}, "epsilon must be a finite"),
+        ({"cutoff": 5.0, "alpha": 0.2}, "not both"),
+        ({"alpha": 1.5}, r"alpha must lie in \[0, 1\]"),
+        ({"alpha": -0.1}, r"alpha must lie in \[0, 1\]"),
+        ({"cutoff": 50.0}, r"cutoff \* dt must lie in \[0, 1\]"),
+        ({"a_s": 0.0}, "a_s must be negative"),
+        ({"a_s": (-1.0, 2.0)}, "a_s must be negative"),
+        ({"a_s": ()}, "non-empty"),
+        ({"a_s": "fast"}, "a_s must be a number"),
+        ({"a_s": -17.0}, "too fast for dt"),
+        ({"on_switch": "restart"}, r"on_switch must be one of \('keep', 'reset'\)"),
+        ({"switch_on": "input"}, "switch_on must be one of"),
+        ({"filter_input": "next"}, "filter_input must be one of"),
+        ({"action_low": 1.0, "action_high": 1.0}, "action_low must be below"),
+        ({"action_low": (-1.0, 2.0), "action_high": 1.0}, "action_low must be below"),
+        ({"action_low": (-1.0, -1.0), "action_high": (1.0,) * 3}, "2 entries and action_high has"),
+        ({"action_low": float("nan")}, "action_low must be a number"),
+        ({"action_low": [True]}, "action_low must be a number"),
+    ],
+)
+def test_bad_settings_are_named(settings, message):
+    with pytest.raises(ValueError, match=message):
+        L1Config(**{"dt": 0.1, **settings})
+
+
+def test_rates_up_to_the_stability_limit_are_accepted():
+    for product in (0.1, 1.0, 1.59):
+        gain = L1Config(0.1, a_s=-product / 0.1).predictor_gain
+        assert abs(1 - gain) < 1
+    with pytest.raises(ValueError, match="unstable"):
+        L1Config(0.1, a_s=-16.0)
+
+
+def test_dimensions_are_checked():
+    config = L1Config(0.1, a_s=(-1.0, -2.0), action_low=(-1.0,), action_high=1.0)
+    config.check_dimensions(2, 1)
+    with pytest.raises(ValueError, match="a_s has 2 entries, expected one number or 3"):
+        config.check_dimensions(3, 1)
+    with pytest.raises(ValueError, match="action_low has 1 entries, expected one number or 2"):
+        config.check_dimensions(2, 2)
+
+
+def test_lists_become_tuples_and_configurations_hash():
+    config = L1Config(0.1, a_s=[-1, -2], action_low=[-1.0, -2.0], action_high=3)
+    assert config.a_s == (-1.0, -2.0)
+    assert config.action_high == (3.0, 3.0)
+    assert hash(config) == hash(L1Config(0.1, a_s=(-1.0, -2.0), action_low=(-1.0, -2.0),
+                                         action_high=(3.0, 3.0)))  # fmt: skip
+
+
+def test_unknown_setting_is_refused():
+    with pytest.raises(TypeError, match="omega"):
+        L1Config(0.1, omega=3.0)

@@ -1,0 +1,258 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchrl_l1.control import L1Config, L1State, init, step
+from torchrl_l1.control.law import saturate
+
+
+def well_conditioned(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    """Random tall matrices whose singular values lie between 0.5 and 1.5."""
+    u, _, vt = np.linalg.svd(rng.normal(size=shape), full_matrices=False)
+    return u * rng.uniform(0.5, 1.5, size=(*shape[:-2], 1, shape[-1])) @ vt
+
+
+def tensors(*arrays: np.ndarray) -> list[torch.Tensor]:
+    return [torch.as_tensor(array) for array in arrays]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    n=st.integers(1, 9),
+    excess=st.integers(0, 8),
+    dt=st.floats(1e-3, 0.1),
+    alpha=st.floats(0.0, 1.0),
+    filter_input=st.sampled_from(["current", "previous"]),
+    bound=st.sampled_from([None, 0.5]),
+    scalar_rate=st.booleans(),
+)
+def test_agrees_with_the_formulas_of_the_paper(
+    numpy_l1, seed, n, excess, dt, alpha, filter_input, bound, scalar_rate
+):
+    m = max(1, n - excess)
+    rng = np.random.default_rng(seed)
+    rates = -rng.uniform(0.05, 12.0, size=n)
+    if scalar_rate:
+        rates = np.full(n, rates[0])
+    config = L1Config(
+        dt,
+        alpha=alpha,
+        a_s=float(rates[0]) if scalar_rate else tuple(rates.tolist()),
+        filter_input=filter_input,
+        action_low=None if bound is None else -bound,
+        action_high=bound,
+    )
+    limits = {} if bound is None else {"low": -bound, "high": bound}
+    oracle = numpy_l1(dt, alpha / dt, rates, filter_input=filter_input, **limits)
+    state = init([], n, m, dtype=torch.float64)
+    for t in range(8):
+        x, drift, u_rl = rng.normal(size=n), rng.normal(size=n), rng.normal(size=m)
+        jac = well_conditioned(rng, n, m)
+        restart = t in (0, 5)
+        u_rl_clipped = np.clip(u_rl, oracle.low, oracle.high)
+        if restart:
+            oracle.start(x, m)
+        expected = oracle.control(x, u_rl_clipped, drift, jac)
+        u, state, diagnostics = step(
+            config, state, *tensors(x, u_rl, drift, jac), torch.tensor([restart])
+        )
+        np.testing.assert_allclose(u, expected, atol=1e-9, rtol=1e-9)
+        np.testing.assert_allclose(state.sigma_m, oracle.sigma_m, atol=1e-9, rtol=1e-9)
+        np.testing.assert_allclose(state.x_hat, oracle.x_hat, atol=1e-9, rtol=1e-9)
+        np.testing.assert_allclose(
+            diagnostics.unmatched.item(), np.linalg.norm(oracle.sigma_um), atol=1e-7, rtol=1e-9
+        )
+        assert not diagnostics.ill_conditioned
+
+
+def test_float32_agrees_with_float64():
+    rng = np.random.default_rng(0)
+    x, drift, u_rl, jac = (
+        torch.as_tensor(a)
+        for a in (
+            rng.normal(size=(9, 5)),
+            rng.normal(size=(9, 5)),
+            rng.normal(size=(9, 2)),
+            well_conditioned(rng, 9, 5, 2),
+        )
+    )
+    config = L1Config(0.04)
+    results = []
+    for dtype in (torch.float64, torch.float32):
+        state = init([9], 5, 2, dtype=dtype)
+        for k in range(5):
+            u, state, _ = step(
+                config, state, *(v.to(dtype) for v in (x + 0.1 * k, u_rl, drift, jac))
+            )
+        assert u.dtype == dtype and all(
+            v.dtype == dtype for v in (state.x_hat, state.q, state.sigma_m)
+        )
+        results.append((u, state.x_hat))
+    for a, b in zip(*results, strict=True):
+        torch.testing.assert_close(b.double(), a, atol=2e-5, rtol=2e-5)
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (3,), (2, 3)])
+def test_environments_do_not_interact(batch):
+    rng = np.random.default_rng(1)
+    n, m = 4, 2
+    x, drift = rng.normal(size=(6, *batch, n)), rng.normal(size=(*batch, n))
+    u_rl, jac = rng.normal(size=(*batch, m)), well_conditioned(rng, *batch, n, m)
+    config = L1Config(0.05, action_low=-1.0, action_high=1.0)
+
+    def run(index: tuple[int, ...] | None) -> torch.Tensor:
+        def pick(a: np.ndarray) -> torch.Tensor:
+            return torch.as_tensor(a if index is None else a[index])
+
+        state = init([] if index is not None else batch, n, m, dtype=torch.float64)
+        for k in range(6):
+            u, state, _ = step(config, state, pick(x[k]), pick(u_rl), pick(drift), pick(jac))
+        return u
+
+    together = run(None)
+    assert together.shape == (*batch, m)
+    for index in np.ndindex(*batch):
+        torch.testing.assert_close(together[index], run(index), atol=1e-13, rtol=1e-13)
+
+
+def random_step(seed: int, batch: int = 5, n: int = 4, m: int = 2):
+    rng = np.random.default_rng(seed)
+    return tensors(
+        rng.normal(size=(batch, n)),
+        rng.normal(size=(batch, m)),
+        rng.normal(size=(batch, n)),
+        well_conditioned(rng, batch, n, m),
+    )
+
+
+def started_state(config: L1Config, batch: int = 5, n: int = 4, m: int = 2) -> L1State:
+    state = init([batch], n, m, dtype=torch.float64)
+    for seed in range(3):
+        _, state, _ = step(config, state, *random_step(seed, batch, n, m))
+    return state
+
+
+def test_restart_concerns_its_environment_only():
+    config = L1Config(0.05)
+    state = started_state(config)
+    inputs = random_step(7)
+    one = torch.zeros(5, 1, dtype=torch.bool)
+    one[2] = True
+    u_kept, kept, _ = step(config, state, *inputs)
+    u, mixed, _ = step(config, state, *inputs, one)
+    u_fresh, fresh, _ = step(config, init([5], 4, 2, dtype=torch.float64), *inputs)
+    others = [0, 1, 3, 4]
+    for mixed_value, kept_value, fresh_value in (
+        (u, u_kept, u_fresh),
+        (mixed.x_hat, kept.x_hat, fresh.x_hat),
+        (mixed.q, kept.q, fresh.q),
+        (mixed.sigma_m, kept.sigma_m, fresh.sigma_m),
+    ):
+        torch.testing.assert_close(mixed_value[others], kept_value[others], atol=0, rtol=0)
+        torch.testing.assert_close(mixed_value[2], fresh_value[2], atol=0, rtol=0)
+    assert not torch.equal(kept.x_hat[2], fresh.x_hat[2])
+    # A restart is what the first step is, whatever the state held.
+    unstarted = state._replace(started=~one)
+    torch.testing.assert_close(step(config, unstarted, *inputs)[0], u, atol=0, rtol=0)
+
+
+@pytest.mark.parametrize("bounded", [True, False])
+def test_state_does_not_alias_the_inputs(bounded):
+    bounds = {"action_low": -1.0, "action_high": 1.0} if bounded else {}
+    config = L1Config(0.05, **bounds)
+    state = started_state(config)
+    inputs = random_step(11)
+    before = [value.clone() for value in state]
+    u, following, _ = step(config, state, *inputs)
+    expected = [u.clone(), *(value.clone() for value in following)]
+    for value in inputs:
+        value.zero_()
+    for value, old in zip(state, before, strict=True):
+        torch.testing.assert_close(value, old, atol=0, rtol=0)
+    u_rl = inputs[1]
+    assert u.data_ptr() != u_rl.data_ptr()
+    for value, old in zip([u, *following], expected, strict=True):
+        torch.testing.assert_close(value, old, atol=0, rtol=0)
+
+
+@pytest.mark.parametrize("which", ["observation", "u_rl", "drift", "jacobian"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_data_that_are_not_finite_stay_in_their_environment(which, value):
+    config = L1Config(0.05)
+    state = started_state(config)
+    good = random_step(3)
+    bad = [tensor.clone() for tensor in good]
+    bad[["observation", "u_rl", "drift", "jacobian"].index(which)][1] = value
+    u_good, state_good, _ = step(config, state, *good)
+    u, following, diagnostics = step(config, state, *bad)
+    assert diagnostics.non_finite.squeeze(-1).tolist() == [False, True, False, False, False]
+    others = [0, 2, 3, 4]
+    torch.testing.assert_close(u[others], u_good[others], atol=0, rtol=0)
+    torch.testing.assert_close(following.x_hat[others], state_good.x_hat[others], atol=0, rtol=0)
+    # L1 stands aside and begins again at the next step.
+    torch.testing.assert_close(u[1], bad[1][1], equal_nan=True, atol=0, rtol=0)
+    assert not following.started[1] and following.started[others].all()
+    for entry in following:
+        assert entry.isfinite().all()
+    for entry in diagnostics:
+        assert entry.isfinite().all()
+    again = random_step(4)
+    u, recovered, diagnostics = step(config, following, *again)
+    assert recovered.started.all() and not diagnostics.non_finite.any()
+    torch.testing.assert_close(u[1], again[1][1])
+
+
+def test_the_estimate_is_bounded_by_the_disturbance():
+    # |x_err| obeys e' = (1 - gain) e - J d, so |sigma_m| <= kappa |d| / (1 - |1 - gain|).
+    config = L1Config(0.05)
+    rng = np.random.default_rng(5)
+    jac = torch.as_tensor(well_conditioned(rng, 1, 4, 1))
+    state = init([1], 4, 1, dtype=torch.float64)
+    x = torch.zeros(1, 4, dtype=torch.float64)
+    drift = torch.zeros_like(x)
+    u_rl = torch.zeros(1, 1, dtype=torch.float64)
+    bound = config.adaptation_gain / (1 - abs(1 - config.predictor_gain))
+    largest = 0.0
+    for _ in range(500):
+        u, state, _ = step(config, state, x, u_rl, drift, jac)
+        d = torch.as_tensor(rng.choice([-1.0, 1.0], size=(1, 1)))
+        x = x + (jac @ (u + d).unsqueeze(-1)).squeeze(-1)
+        largest = max(largest, state.sigma_m.abs().item(), state.q.abs().item())
+    assert 0.5 < largest <= bound * (1 + 1e-9)
+
+
+def test_bounds_apply_to_the_policy_and_to_the_executed_input():
+    config = L1Config(0.05, action_low=(-1.0, -0.5), action_high=0.5)
+    state = started_state(config)
+    x, _, drift, jac = random_step(3)
+    u_rl = torch.full((5, 2), 10.0, dtype=torch.float64)
+    u, following, diagnostics = step(config, state, x, u_rl, drift, jac)
+    low, high = torch.tensor([-1.0, -0.5]), torch.tensor([0.5, 0.5])
+    assert (u >= low).all() and (u <= high).all()
+    torch.testing.assert_close(u, torch.clamp(0.5 - following.q, low.double(), high.double()))
+    cut = (u != 0.5 - following.q).double().mean(-1, keepdim=True)
+    torch.testing.assert_close(diagnostics.saturation, cut)
+    # The predictor sees the saturated input.
+    unsaturated = step(L1Config(0.05), state, x, u_rl, drift, jac)[1].x_hat
+    assert not torch.allclose(unsaturated, following.x_hat)
+
+
+def test_saturate_without_bounds_changes_nothing():
+    action = torch.tensor([1e9, -1e9])
+    assert torch.equal(saturate(L1Config(0.1), action), action)
+    assert saturate(L1Config(0.1, action_low=-1.0), action).tolist() == [1e9, -1.0]
+    assert saturate(L1Config(0.1, action_high=(1.0, 2.0)), action).tolist() == [1.0, -1e9]
+
+
+def test_zero_bandwidth_estimates_without_acting():
+    config = L1Config(0.05, alpha=0.0)
+    state = started_state(config)
+    inputs = random_step(3)
+    u, following, _ = step(config, state, *inputs)
+    torch.testing.assert_close(u, inputs[1], atol=0, rtol=0)
+    assert following.sigma_m.abs().min() > 0
