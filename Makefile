@@ -24,7 +24,8 @@ help: ## Show this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' Makefile
 
 demo: $(VENV)/.installed-base ## Train METRPO on the pendulum, then plot returns against actuator bias
-	$(BIN)/torchrl-l1 run metrpo/inverted_pendulum seed=$(SEED) run_dir=$(DEMO_DIR) --resume
+	$(BIN)/torchrl-l1 run metrpo/inverted_pendulum l1=off outer_iterations=5 seed=$(SEED) \
+	    run_dir=$(DEMO_DIR) --resume
 	$(BIN)/torchrl-l1 evaluate $(DEMO_DIR) --l1 off paper --bias 0 0.5 1 1.5 --filmstrip
 
 test: $(VENV)/.installed-test ## Run the tests and the examples in the docstrings

@@ -27,9 +27,7 @@ def test_without_memory_each_sample_is_its_own_operating_point():
     torch.testing.assert_close(
         out["affine", "jacobian"], (2 * action).unsqueeze(-1).expand(5, 3, 1)
     )
-    torch.testing.assert_close(
-        out["affine", "drift"], 0.1 * data["observation"] - action.square()
-    )
+    torch.testing.assert_close(out["affine", "drift"], 0.1 * data["observation"] - action.square())
     assert "next" not in out.keys()
 
 
@@ -39,9 +37,7 @@ def test_operating_point_is_remembered_until_the_tolerance_is_exceeded():
     data = TensorDict(
         observation=torch.zeros(2, 3),
         action=torch.tensor([[0.1], [1.0]]),
-        affine=TensorDict(
-            u_bar=u_bar, started=torch.ones(2, 1, dtype=torch.bool), batch_size=[2]
-        ),
+        affine=TensorDict(u_bar=u_bar, started=torch.ones(2, 1, dtype=torch.bool), batch_size=[2]),
         batch_size=[2],
     )
     out = affinizer(data)

@@ -13,6 +13,7 @@ RNG = np.random.default_rng(0)
 A = 0.1 * RNG.normal(size=(N, N))
 B = RNG.normal(size=(N, M))
 C = 0.3 * RNG.normal(size=(N, M))
+TENSORS = tuple(torch.as_tensor(matrix) for matrix in (A, B, C))
 
 
 def numpy_model(x: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -24,7 +25,7 @@ def numpy_gradient(x: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def torch_model(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
-    a, b, c = (torch.as_tensor(matrix).to(x) for matrix in (A, B, C))
+    a, b, c = (matrix.to(x.dtype) for matrix in TENSORS)
     return x @ a.T + u.tanh() @ b.T + u.square() @ c.T * x[..., :1].cos()
 
 
@@ -64,7 +65,9 @@ def test_agrees_with_algorithm_2(numpy_l1, on_switch, switch_on, filter_input):
             x[2] = rng.normal(size=N)
             fresh = init([batch], N, M, dtype=torch.float64)
             mask = torch.arange(batch).unsqueeze(-1) == 2
-            state = type(state)(*(torch.where(mask, f, s) for f, s in zip(fresh, state, strict=True)))
+            state = type(state)(
+                *(torch.where(mask, f, s) for f, s in zip(fresh, state, strict=True))
+            )
         u, state, diagnostics = augment(
             config, model, state, torch.as_tensor(x), torch.as_tensor(u_rl)
         )

@@ -108,7 +108,9 @@ def test_tensordict_modules_of_the_change_and_of_the_next_observation(net):
     torch.testing.assert_close(jacobian, expected)
     following = ActionJacobian(
         TensorDictModule(
-            lambda x, u: x + net(x, u), [("agent", "pose"), "torque"], [("next", "pose"), "other"][:1]
+            lambda x, u: x + net(x, u),
+            [("agent", "pose"), "torque"],
+            [("next", "pose"), "other"][:1],
         ),
         observation_key=("agent", "pose"),
         action_key="torque",

@@ -69,11 +69,28 @@ def test_foreign_directory_is_not_touched(tiny_recipe: Recipe, tmp_path: Path) -
     assert snapshot(tmp_path) == before
 
 
+def test_run_killed_before_its_first_checkpoint_starts_over(
+    tiny_recipe: Recipe, tmp_path: Path
+) -> None:
+    directory = run(tiny_recipe())
+    complete = (directory / "metrics.csv").read_text()
+    for file in directory.iterdir():
+        if file.name not in ("versions.json", ".lock"):
+            file.unlink()
+    assert run(tiny_recipe()) == directory
+    assert (directory / "metrics.csv").read_text() == complete
+
+
 def test_second_process_in_the_same_directory_is_refused(tmp_path: Path) -> None:
-    first = RunDirectory(tmp_path / "run")
-    first.open({"seed": 0}, resume=False)
-    with pytest.raises(RunDirectoryError, match="another process"):
-        RunDirectory(tmp_path / "run").open({"seed": 0}, resume=True)
+    first, second = RunDirectory(tmp_path / "run"), RunDirectory(tmp_path / "run")
+    with (
+        first.open({"seed": 0}, resume=False),
+        pytest.raises(RunDirectoryError, match="another process"),
+        second.open({"seed": 0}, resume=True),
+    ):
+        pass
+    with second.open({"seed": 0}, resume=True):
+        assert second.config_file.exists()
 
 
 def test_bad_settings_are_refused_before_anything_is_written(

@@ -48,8 +48,8 @@ def run(config: DictConfig) -> Path:
         algorithm = build(recipe)
         algorithm.on_phase = lambda phase: progress.set_postfix_str(phase)
         directory = RunDirectory(recipe.run_dir)
-        directory.open(settings, recipe.resume)
-        _run(algorithm, recipe, settings, directory, progress)
+        with directory.open(settings, recipe.resume):
+            _run(algorithm, recipe, settings, directory, progress)
     print(f"Finished: {directory.metrics_file}")
     return directory.path
 

@@ -8,7 +8,8 @@ import io
 import json
 import os
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,10 @@ from omegaconf import OmegaConf
 from torchrl_l1.experiment.schema import VOLATILE_KEYS
 
 PACKAGES = ("torchrl-l1", "torch", "tensordict", "torchrl", "gymnasium", "mujoco", "numpy")
+
+
+# What a run killed in its first moments may leave behind; its directory is still free.
+_BEFORE_CONFIG = (".lock", "versions.json", "versions.json.tmp", "config.yaml.tmp")
 
 
 class RunDirectoryError(Exception):
@@ -44,8 +49,9 @@ class RunDirectory:
         self.metrics_file = self.path / "metrics.csv"
         self.timing_file = self.path / "timing.csv"
 
-    def open(self, config: dict[str, Any], resume: bool) -> None:
-        """Prepare the directory for a run of ``config`` and take hold of it.
+    @contextmanager
+    def open(self, config: dict[str, Any], resume: bool) -> Iterator[None]:
+        """Prepare the directory for a run of ``config`` and hold it for as long as that lasts.
 
         Raises:
             RunDirectoryError: if it holds a run and ``resume`` is not set, if that run has
@@ -59,15 +65,20 @@ class RunDirectory:
                     "another directory with run_dir=..."
                 )
             self._check_same(config)
-        elif self.path.exists() and any(self.path.iterdir()):
+        elif self.path.exists() and any(f.name not in _BEFORE_CONFIG for f in self.path.iterdir()):
             raise RunDirectoryError(
                 f"{self.path} is not empty and holds no run; choose another run_dir"
             )
         self.path.mkdir(parents=True, exist_ok=True)
-        self._lock()
-        if not self.config_file.exists():
-            write_atomically(self.path / "versions.json", json.dumps(versions(), indent=2))
-            write_atomically(self.config_file, OmegaConf.to_yaml(OmegaConf.create(config)))
+        with (self.path / ".lock").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise RunDirectoryError(f"another process is running in {self.path}") from error
+            if not self.config_file.exists():
+                write_atomically(self.path / "versions.json", json.dumps(versions(), indent=2))
+                write_atomically(self.config_file, OmegaConf.to_yaml(OmegaConf.create(config)))
+            yield
 
     def _check_same(self, config: dict[str, Any]) -> None:
         stored = OmegaConf.to_container(OmegaConf.load(self.config_file))
@@ -84,13 +95,6 @@ class RunDirectory:
                 + "\n  ".join(different)
                 + "\nGive the same settings, or another run_dir."
             )
-
-    def _lock(self) -> None:
-        self._lock_handle = (self.path / ".lock").open("w")
-        try:
-            fcntl.flock(self._lock_handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise RunDirectoryError(f"another process is running in {self.path}") from error
 
     def save_checkpoint(self, state: dict[str, Any]) -> None:
         """Replace the checkpoint; a kill at any moment leaves the old or the new one."""

@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+import shutil
+import sys
+import sysconfig
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchrl_l1.control import ActionJacobian, L1Config, augment, init
+from torchrl_l1.control.compilation import compiled
+from torchrl_l1.control.faces import make_step
+from torchrl_l1.dynamics import EnsembleDynamics
+
+HEADERS = Path(sysconfig.get_path("include")) / "Python.h"
+needs_compiler = pytest.mark.skipif(
+    shutil.which("g++") is None or not HEADERS.exists() or sys.platform == "win32",
+    reason="no working C++ compiler",
+)
+
+
+def trajectory(step, n: int = 4, m: int = 1):
+    generator = torch.Generator().manual_seed(0)
+    state, history = init([3], n, m), []
+    for _ in range(5):
+        x = torch.randn(3, n, generator=generator)
+        u_rl = torch.randn(3, m, generator=generator)
+        u, state, _ = step(state, x, u_rl)
+        history.append(torch.cat([u, state.x_hat], -1))
+    return torch.stack(history)
+
+
+@needs_compiler
+@torch.no_grad()
+def test_compiled_step_agrees_and_sees_weights_updated_in_place():
+    torch.manual_seed(0)
+    model = EnsembleDynamics(4, 1, members=2, hidden=(8, 8))
+    config = L1Config(0.04, epsilon=0.05, action_low=-1.0, action_high=1.0)
+    step = make_step(config, ActionJacobian(model), True)
+    eager = make_step(config, ActionJacobian(model), False)
+    before = trajectory(step)
+    torch.testing.assert_close(before, trajectory(eager), atol=1e-5, rtol=1e-5)
+    for weight in model.parameters():
+        weight.mul_(1.5)
+    after = trajectory(step)
+    torch.testing.assert_close(after, trajectory(eager), atol=1e-5, rtol=1e-5)
+    assert not torch.allclose(before, after)
+
+
+@torch.no_grad()
+def test_auto_falls_back_silently_without_a_compiler(monkeypatch, capfd):
+    def broken(function, **options):
+        assert options == {"fullgraph": True}
+
+        def call(*args):
+            raise RuntimeError("no compiler")
+
+        return call
+
+    monkeypatch.setattr(torch, "compile", broken)
+    model = ActionJacobian(lambda x, u: 0.1 * x + u.sin())
+    config = L1Config(0.04)
+    step = make_step(config, model, "auto")
+    expected = trajectory(lambda *args: augment(config, model, *args))
+    torch.testing.assert_close(trajectory(step), expected, atol=0, rtol=0)
+    assert capfd.readouterr() == ("", "")
+    with pytest.raises(RuntimeError, match="no compiler"):
+        trajectory(make_step(config, model, True))
+
+
+@torch.no_grad()
+def test_auto_reports_the_fault_of_the_arguments_not_the_compilers(monkeypatch):
+    monkeypatch.setattr(torch, "compile", lambda function, **options: function)
+    step = make_step(L1Config(0.04), ActionJacobian(lambda x, u: x[..., :1]), "auto")
+    with pytest.raises(ValueError, match="the dynamics returned shape"):
+        step(init([3], 4, 1), torch.zeros(3, 4), torch.zeros(3, 1))
+
+
+@torch.no_grad()
+def test_many_controllers_compile_in_one_process(monkeypatch):
+    # torch refuses more than eight graphs for one code object.
+    real = torch.compile
+    monkeypatch.setattr(
+        torch, "compile", lambda function, **options: real(function, backend="eager", **options)
+    )
+    model = ActionJacobian(lambda x, u: 0.1 * x + u.sin())
+    for k in range(10):
+        step = make_step(L1Config(0.01 * (k + 1)), model, True)
+        step(init([2], 3, 1), torch.zeros(2, 3), torch.zeros(2, 1))
+
+
+def test_modes():
+    def function(x):
+        return x
+
+    assert compiled(function, False) is function
+    with pytest.raises(ValueError, match="compile must be True, False or 'auto', got 'yes'"):
+        compiled(function, "yes")

@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+from torchrl.envs import Compose, DoubleToFloat, GymEnv, SerialEnv, StepCounter, TransformedEnv
+
+from torchrl_l1.control import ActionJacobian, L1Config, L1Controller, L1Transform
+from torchrl_l1.dynamics import EnsembleDynamics
+
+CONFIG = L1Config(0.04, epsilon=0.02, action_low=-3.0, action_high=3.0)
+
+
+def make_model(n: int = 4, m: int = 1) -> EnsembleDynamics:
+    torch.manual_seed(0)
+    return EnsembleDynamics(n, m, members=2, hidden=(16,), activation="tanh")
+
+
+def make_actor() -> TensorDictModule:
+    torch.manual_seed(1)
+    return TensorDictModule(nn.Linear(4, 1), ["observation"], ["action"])
+
+
+def make_env(num_envs: int, *transforms) -> TransformedEnv:
+    base = SerialEnv(num_envs, lambda: GymEnv("InvertedPendulum-v5"))
+    env = TransformedEnv(base, Compose(DoubleToFloat(), *transforms, StepCounter(7)))
+    env.set_seed(0)
+    return env
+
+
+@pytest.mark.parametrize("config", [CONFIG, L1Config.reference(0.04, epsilon=0.02)])
+def test_controller_and_transform_give_the_same_trajectory(config):
+    model, actor = make_model(), make_actor()
+    controller = L1Controller(model, config)
+    inside = make_env(3, L1Transform(model, config)).rollout(25, actor, break_when_any_done=False)
+    if config.action_low is None:
+        # The transform takes the bounds of the action spec, the controller has no environment.
+        config = L1Config.reference(0.04, epsilon=0.02, action_low=-3.0, action_high=3.0)
+        controller = L1Controller(model, config)
+    outside = make_env(3, controller.make_primer()).rollout(
+        25, TensorDictSequential(actor, controller), break_when_any_done=False
+    )
+    torch.testing.assert_close(outside["observation"], inside["observation"], atol=0, rtol=0)
+    torch.testing.assert_close(outside["l1", "u_rl"], inside["action"], atol=0, rtol=0)
+    torch.testing.assert_close(outside["action"], inside["next", "l1", "u_exec"], atol=0, rtol=0)
+    assert outside["next", "done"].sum() >= 6
+    for name in ("x_hat", "u_bar", "q", "sigma_m", "n_switch", "started", "switch", "unmatched"):
+        torch.testing.assert_close(
+            outside["next", "l1", name], inside["next", "l1", name], atol=0, rtol=0
+        )
+    assert (outside["action"] != outside["l1", "u_rl"]).any()
+
+
+def test_state_restarts_with_its_environment():
+    controller = L1Controller(make_model(), CONFIG)
+    data = make_env(3, controller.make_primer()).rollout(
+        25, TensorDictSequential(make_actor(), controller), break_when_any_done=False
+    )
+    started = data["l1", "started"]
+    # Not started exactly at the first step and after each reset.
+    expected = torch.ones_like(started)
+    expected[:, 0] = False
+    expected[:, 1:] = ~data["next", "done"][:, :-1]
+    assert torch.equal(started, expected)
+
+
+def tensordict(controller: L1Controller, **changes) -> TensorDict:
+    data = TensorDict(observation=torch.zeros(2, 4), action=torch.zeros(2, 1), batch_size=[2])
+    data["l1"] = controller.make_primer().primers["l1"].zero([2])
+    return data.update(changes)
+
+
+def test_missing_entries_are_named():
+    controller = L1Controller(make_model(), CONFIG)
+    data = tensordict(controller)
+    with pytest.raises(KeyError, match=r"no state under 'l1': append the primer"):
+        controller(data.exclude("l1"))
+    with pytest.raises(KeyError, match=r"found no \['q'\] under 'l1'"):
+        controller(data.exclude(("l1", "q")))
+    with pytest.raises(KeyError, match="found no 'action' in the tensordict, only"):
+        controller(data.exclude("action"))
+
+
+def test_wrong_widths_are_named():
+    controller = L1Controller(make_model(), CONFIG)
+    with pytest.raises(ValueError, match=r"'observation' has shape \(2, 5\), expected \(2, 4\)"):
+        controller(tensordict(controller, observation=torch.zeros(2, 5)))
+    with pytest.raises(ValueError, match=r"'action' has shape \(2, 2\), expected \(2, 1\)"):
+        controller(tensordict(controller, action=torch.zeros(2, 2)))
+    with pytest.raises(ValueError, match="observation_dim=3 was given, but the model has"):
+        L1Controller(make_model(), CONFIG, observation_dim=3)
+    with pytest.raises(ValueError, match="a_s has 2 entries"):
+        L1Controller(make_model(), L1Config(0.1, a_s=(-1.0, -1.0))).make_primer()
+    with pytest.raises(ValueError, match="give L1Controller observation_dim and action_dim"):
+        L1Controller(lambda x, u: x, CONFIG).make_primer()
+
+
+def test_other_keys_and_models_without_declared_widths():
+    model = TensorDictModule(
+        lambda x, u: x + 0.1 * u, in_keys=["pose", "torque"], out_keys=["next_pose"]
+    )
+    jacobian = ActionJacobian(
+        model, observation_key="pose", action_key="torque", predicts="next_observation"
+    )
+    controller = L1Controller(
+        jacobian,
+        CONFIG,
+        observation_key="pose",
+        action_key="torque",
+        key="adaptive",
+        observation_dim=4,
+        action_dim=1,
+        diagnostics=False,
+    )
+    data = TensorDict(pose=torch.ones(2, 4), torque=torch.full((2, 1), 0.5), batch_size=[2])
+    data["adaptive"] = controller.make_primer().primers["adaptive"].zero([2])
+    out = controller(data)
+    torch.testing.assert_close(out["next", "adaptive", "x_hat"], torch.full((2, 4), 1.05))
+    torch.testing.assert_close(out["adaptive", "u_rl"], torch.full((2, 1), 0.5))
+    assert "switch" not in out["next", "adaptive"].keys()
+    assert set(controller.out_keys) <= set(out.keys(True, True))
+
+
+def test_the_model_is_not_among_the_parameters_and_is_shared():
+    model = make_model()
+    model.train()
+    controller = L1Controller(model, CONFIG)
+    assert not list(controller.parameters()) and not controller.state_dict()
+    controller.eval()
+    assert model.training
+    first = controller(tensordict(controller))["next", "l1", "x_hat"]
+    with torch.no_grad():
+        model.network.biases[-1].add_(1.0)
+    second = controller(tensordict(controller))["next", "l1", "x_hat"]
+    assert not torch.allclose(first, second)
+
+
+def test_survives_pickling():
+    controller = L1Controller(make_model(), CONFIG)
+    copy = pickle.loads(pickle.dumps(controller))
+    expected = controller(tensordict(controller))["next", "l1", "x_hat"]
+    torch.testing.assert_close(copy(tensordict(controller))["next", "l1", "x_hat"], expected)

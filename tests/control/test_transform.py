@@ -1,0 +1,260 @@
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs import (
+    ActionScaling,
+    Compose,
+    DoubleToFloat,
+    GymEnv,
+    ObservationNorm,
+    SerialEnv,
+    TransformedEnv,
+)
+from torchrl.envs.transforms import Transform
+
+from torchrl_l1.control import ActionJacobian, L1Config, L1Transform
+from torchrl_l1.dynamics import EnsembleDynamics
+
+
+def make_model(n: int = 3, m: int = 1) -> EnsembleDynamics:
+    torch.manual_seed(0)
+    return EnsembleDynamics(n, m, members=2, hidden=(16,), activation="tanh")
+
+
+def make_actor(n: int = 3, m: int = 1) -> TensorDictModule:
+    torch.manual_seed(1)
+    return TensorDictModule(nn.Linear(n, m), ["observation"], ["action"])
+
+
+def make_env(transform: Transform, *others: Transform) -> TransformedEnv:
+    env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(transform, *others))
+    env.set_seed(0)
+    return env
+
+
+def test_settings_come_from_a_config_or_from_keywords():
+    assert L1Transform(make_model(), dt=0.1, epsilon=0.3).config == L1Config(0.1, epsilon=0.3)
+    config = L1Config.reference(0.1)
+    assert L1Transform(make_model(), config).config is config
+    with pytest.raises(ValueError, match=r"give config or \['dt', 'alpha'\], not both"):
+        L1Transform(make_model(), config, dt=0.1, alpha=0.2)
+    with pytest.raises(ValueError, match="L1Transform needs dt"):
+        L1Transform(make_model())
+    with pytest.raises(ValueError, match="dt must be a positive time"):
+        L1Transform(make_model(), dt=0.0)
+    with pytest.raises(TypeError, match=r"unknown settings \['epsilonn'\]"):
+        L1Transform(make_model(), dt=0.1, epsilonn=0.3)
+
+
+def test_the_policy_action_stays_and_the_environment_gets_the_executed_input():
+    received = []
+
+    class Recorder(Transform):
+        def _inv_call(self, tensordict):
+            received.append(tensordict["action"].clone())
+            return tensordict
+
+    env = make_env(Recorder(), L1Transform(make_model(), dt=0.05))
+    data = env.rollout(12, make_actor())
+    executed = data["next", "l1", "u_exec"]
+    torch.testing.assert_close(torch.stack(received[-12:]), executed, atol=0, rtol=0)
+    torch.testing.assert_close(data["action"], make_actor()(data.clone())["action"])
+    assert (executed[1:] != data["action"][1:]).all()
+    assert "_l1_pending" not in data.keys(True)
+    # The state is carried on.
+    torch.testing.assert_close(
+        data["l1", "x_hat"][1:], data["next", "l1", "x_hat"][:-1], atol=0, rtol=0
+    )
+
+
+def test_bounds_are_the_action_specs_unless_given():
+    def executed(transform: L1Transform, *before: Transform) -> torch.Tensor:
+        env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(*before, transform))
+        actor = TensorDictModule(lambda x: 5 + 0 * x[..., :1], ["observation"], ["action"])
+        return env.rollout(3, actor)["next", "l1", "u_exec"]
+
+    assert executed(L1Transform(make_model(), dt=0.05)).max() == 2.0
+    assert executed(L1Transform(make_model(), dt=0.05, action_high=0.5)).max() == 0.5
+    inf = float("inf")
+    assert executed(L1Transform(make_model(), dt=0.05, action_high=inf)).max() >= 5.0
+    # The spec that counts is the one at L1's place in the chain.
+    assert executed(L1Transform(make_model(), dt=0.05), ActionScaling()).max() == 1.0
+
+
+def test_diagnostics_can_be_left_out():
+    env = make_env(L1Transform(make_model(), dt=0.05, diagnostics=False))
+    data = env.rollout(3, make_actor())
+    assert set(data["next", "l1"].keys()) == {
+        "x_hat", "u_bar", "q", "sigma_m", "n_switch", "started", "u_exec",
+    }  # fmt: skip
+    assert "switch" in make_env(L1Transform(make_model(), dt=0.05)).observation_spec["l1"].keys()
+
+
+def test_the_model_keeps_its_mode_and_is_shared_not_registered():
+    model = make_model()
+    model.train()
+    env = make_env(L1Transform(model, dt=0.05, epsilon=1e6))
+    assert model.training
+    env.eval()
+    assert model.training
+    assert not list(env.parameters()) and not env.state_dict()
+    actor = make_actor()
+    env.set_seed(0)
+    first = env.rollout(3, actor)
+    with torch.no_grad():
+        model.network.biases[-1].add_(1.0)
+    env.set_seed(0)
+    second = env.rollout(3, actor)
+    assert not torch.allclose(first["next", "l1", "x_hat"], second["next", "l1", "x_hat"])
+
+
+def test_refused_in_a_replay_buffer():
+    data = make_env(L1Transform(make_model(), dt=0.05)).rollout(3, make_actor())
+    for transform in (
+        L1Transform(make_model(), dt=0.05),
+        Compose(L1Transform(make_model(), dt=0.05)),
+    ):
+        buffer = ReplayBuffer(storage=LazyTensorStorage(10), batch_size=2, transform=transform)
+        with pytest.raises(RuntimeError, match="append it to a TransformedEnv, not to a replay"):
+            buffer.extend(data)
+    buffer = ReplayBuffer(storage=LazyTensorStorage(10), batch_size=2)
+    buffer.extend(data)
+    buffer.append_transform(L1Transform(make_model(), dt=0.05))
+    with pytest.raises(RuntimeError, match="append it to a TransformedEnv, not to a replay"):
+        buffer.sample()
+
+
+def test_a_later_transform_of_the_observation_is_refused():
+    def normalise(**keys) -> ObservationNorm:
+        return ObservationNorm(0.0, 1.0, in_keys=["observation"], **keys)
+
+    l1 = L1Transform(make_model(), dt=0.05)
+    with pytest.raises(ValueError, match="ObservationNorm comes after L1Transform"):
+        make_env(l1, normalise()).reset()
+    nested = TransformedEnv(GymEnv("Pendulum-v1"), L1Transform(make_model(), dt=0.05))
+    nested.append_transform(Compose(normalise()))
+    with pytest.raises(ValueError, match="ObservationNorm comes after L1Transform"):
+        nested.reset()
+    make_env(normalise(), L1Transform(make_model(), dt=0.05)).rollout(2)
+    make_env(L1Transform(make_model(), dt=0.05), normalise(out_keys=["normalised"])).rollout(2)
+
+
+def test_widths_and_keys_that_do_not_fit_are_named():
+    with pytest.raises(ValueError, match="observation_dim=4, but the data have width 3"):
+        make_env(L1Transform(make_model(4), dt=0.05)).reset()
+    with pytest.raises(ValueError, match="a_s has 2 entries, expected one number or 3"):
+        make_env(L1Transform(make_model(), dt=0.05, a_s=(-1.0, -1.0))).reset()
+    with pytest.raises(KeyError, match=r"no observation 'state', only \['observation'\]"):
+        make_env(L1Transform(make_model(), dt=0.05, observation_key="state")).reset()
+    with pytest.raises(ValueError, match="vector of floating-point numbers as action"):
+        TransformedEnv(GymEnv("CartPole-v1"), L1Transform(make_model(4), dt=0.05)).reset()
+
+
+def test_a_step_without_its_inputs_is_named():
+    env = make_env(L1Transform(make_model(), dt=0.05))
+    data = env.rand_action(env.reset())
+    with pytest.raises(KeyError, match="no state under 'l1': reset the environment first"):
+        env.step(data.exclude("l1"))
+    with pytest.raises(KeyError, match="found no 'observation'"):
+        env.step(data.exclude("observation"))
+    with pytest.raises(RuntimeError, match="belongs to no environment"):
+        L1Transform(make_model(), dt=0.05)._reset(TensorDict(), TensorDict())
+
+
+class Spoil(Transform):
+    """Makes the observation of one environment not finite, at a step or at reset."""
+
+    def __init__(self, at: int) -> None:
+        super().__init__()
+        self.at, self.count = at, 0
+
+    def _step(self, tensordict, next_tensordict):
+        self.count += 1
+        return self._spoil(next_tensordict)
+
+    def _reset(self, tensordict, tensordict_reset):
+        return self._spoil(tensordict_reset)
+
+    def _spoil(self, tensordict):
+        if self.count == self.at:
+            observation = tensordict["observation"].clone()
+            observation[1, 0] = torch.nan
+            tensordict["observation"] = observation
+        return tensordict
+
+
+def test_a_reset_to_an_observation_that_is_not_finite_is_an_error():
+    base = SerialEnv(2, lambda: GymEnv("Pendulum-v1"))
+    env = TransformedEnv(base, Compose(Spoil(0), L1Transform(make_model(), dt=0.05)))
+    with pytest.raises(ValueError, match=r"not finite \(environments \[\[1\]\]\)"):
+        env.reset()
+    env.close()
+
+
+def test_an_observation_that_is_not_finite_in_a_run_is_flagged():
+    base = SerialEnv(2, lambda: GymEnv("Pendulum-v1"))
+    env = TransformedEnv(base, Compose(Spoil(3), L1Transform(make_model(), dt=0.05)))
+    actor = TensorDictModule(
+        lambda x: 0.1 + 0 * x[..., :1].nan_to_num(), ["observation"], ["action"]
+    )
+    data = env.rollout(8, actor)
+    env.close()
+    flagged = data["next", "l1", "non_finite"].squeeze(-1)
+    assert flagged.nonzero().tolist() == [[1, 3]]
+    torch.testing.assert_close(data["next", "l1", "u_exec"][1, 3], data["action"][1, 3])
+    assert data["l1", "started"].squeeze(-1)[1].tolist() == [0, 1, 1, 1, 0, 1, 1, 1]
+    for value in data["next", "l1"].values():
+        assert value.isfinite().all()
+
+
+def test_float64_environment_and_a_model_without_parameters():
+    env = TransformedEnv(
+        GymEnv("InvertedPendulum-v5"),
+        L1Transform(ActionJacobian(lambda x, u: 0.1 * u.expand_as(x)), dt=0.04),
+    )
+    data = env.rollout(3)
+    assert data["next", "l1", "x_hat"].dtype == torch.float64
+    assert data["next", "l1", "u_exec"].dtype == data["action"].dtype == torch.float32
+    env = TransformedEnv(GymEnv("InvertedPendulum-v5"), L1Transform(make_model(4, 1), dt=0.04))
+    assert env.rollout(3)["next", "l1", "x_hat"].dtype == torch.float32
+
+
+def test_survives_pickling_and_cloning():
+    transform = L1Transform(make_model(), dt=0.05)
+    actor = make_actor()
+    expected = make_env(transform).rollout(5, actor)["next", "l1", "x_hat"]
+    for copy in (pickle.loads(pickle.dumps(transform.clone())), transform.clone()):
+        data = make_env(copy).rollout(5, actor)
+        torch.testing.assert_close(data["next", "l1", "x_hat"], expected, atol=0, rtol=0)
+    assert transform.clone().model is transform.model
+
+
+def test_native_autoreset_restarts_the_environments_that_ended():
+    env = make_env(L1Transform(make_model(), dt=0.05))
+    data = env.rollout(3, make_actor())["next"][-2:].clone()
+    transform = env.transform[0]
+    transform._layout = transform._layout.__class__(
+        **{**transform._layout.__dict__, "batch_size": torch.Size([2])}
+    )
+    mask = torch.tensor([[False], [True]])
+    out = transform._reset_on_native_autoreset(
+        TensorDict(_reset=mask, batch_size=[2]), data.clone()
+    )
+    assert out["l1", "started"].squeeze(-1).tolist() == [True, False]
+    torch.testing.assert_close(out["l1", "x_hat"][0], data["l1", "x_hat"][0])
+    assert out["l1", "x_hat"][1].abs().max() == 0
+
+
+def test_double_to_float_before_l1():
+    env = TransformedEnv(
+        GymEnv("InvertedPendulum-v5"),
+        Compose(DoubleToFloat(), L1Transform(make_model(4, 1), dt=0.04)),
+    )
+    assert env.rollout(3)["observation"].dtype == torch.float32
