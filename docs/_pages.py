@@ -12,7 +12,7 @@ PACKAGES = ("control", "dynamics", "envs", "objectives", "algorithms", "experime
 
 def metrics_table() -> str:
     """Every metric that METRPO logs, as a Markdown table."""
-    from torchrl_l1.algorithms.metrpo import METRICS
+    from torchrl_l1.algorithms.metrpo_metrics import METRICS
 
     rows = [f"| `{name}` | {meaning} |" for name, meaning in METRICS.items()]
     return "\n".join(["| Metric | Meaning |", "|---|---|", *rows, ""])

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from torchrl_l1.algorithms import METRPO, METRPOConfig, Perturbation
-from torchrl_l1.algorithms.metrpo import METRICS, ModelConfig, PolicyConfig
+from torchrl_l1.algorithms.metrpo_config import ModelConfig, PolicyConfig
+from torchrl_l1.algorithms.metrpo_metrics import METRICS
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.objectives import TRPOConfig
@@ -95,6 +96,17 @@ def test_label_decides_what_the_model_is_fitted_to() -> None:
     assert results[0].metrics["model/train_loss"] != results[1].metrics["model/train_loss"]
     with pytest.raises(ValueError, match="label must be 'nominal' or 'executed', got 'both'"):
         make(label="both")
+
+
+def test_imagined_trajectories_start_where_the_configuration_says() -> None:
+    algorithm = make(imagined_from_data=0.25)
+    algorithm.store(algorithm.collection.random(0))
+    starts = algorithm.imagined_starts(40)
+    stored = algorithm.buffer[:]["observation"]
+    from_data = (starts[:, None] == stored).all(-1).any(-1)
+    assert from_data.tolist() == [False] * 30 + [True] * 10
+    # The others are the pendulum's resets: within 0.01 of upright rest.
+    assert starts[:30].abs().max() <= 0.01
 
 
 def test_a_few_iterations_learn_to_balance() -> None:

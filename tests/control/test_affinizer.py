@@ -28,7 +28,7 @@ def test_without_memory_each_sample_is_its_own_operating_point():
         out["affine", "jacobian"], (2 * action).unsqueeze(-1).expand(5, 3, 1)
     )
     torch.testing.assert_close(out["affine", "drift"], 0.1 * data["observation"] - action.square())
-    assert "next" not in out.keys()
+    assert "next" not in out
 
 
 def test_operating_point_is_remembered_until_the_tolerance_is_exceeded():

@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.envs import Compose, DoubleToFloat, GymEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.modules.utils import get_primers_from_module
 
 from torchrl_l1.control import ActionJacobian, L1Config, L1Controller, L1Transform
 from torchrl_l1.dynamics import EnsembleDynamics
@@ -81,7 +82,7 @@ def test_missing_entries_are_named():
         controller(data.exclude("l1"))
     with pytest.raises(KeyError, match=r"found no \['q'\] under 'l1'"):
         controller(data.exclude(("l1", "q")))
-    with pytest.raises(KeyError, match="found no 'action' in the tensordict, only"):
+    with pytest.raises(KeyError, match=r"found no .*action.* only .*l1.*observation"):
         controller(data.exclude("action"))
 
 
@@ -121,7 +122,7 @@ def test_other_keys_and_models_without_declared_widths():
     out = controller(data)
     torch.testing.assert_close(out["next", "adaptive", "x_hat"], torch.full((2, 4), 1.05))
     torch.testing.assert_close(out["adaptive", "u_rl"], torch.full((2, 1), 0.5))
-    assert "switch" not in out["next", "adaptive"].keys()
+    assert ("next", "adaptive", "switch") not in out
     assert set(controller.out_keys) <= set(out.keys(True, True))
 
 
@@ -137,6 +138,12 @@ def test_the_model_is_not_among_the_parameters_and_is_shared():
         model.network.biases[-1].add_(1.0)
     second = controller(tensordict(controller))["next", "l1", "x_hat"]
     assert not torch.allclose(first, second)
+
+
+def test_torchrl_finds_the_primer():
+    policy = TensorDictSequential(make_actor(), L1Controller(make_model(), CONFIG))
+    env = make_env(2, get_primers_from_module(policy))
+    assert env.rollout(3, policy)["next", "l1", "started"].all()
 
 
 def test_survives_pickling():

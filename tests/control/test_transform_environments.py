@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torchrl import set_auto_unwrap_transformed_env
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import (
@@ -25,8 +26,9 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_l1.control import ActionJacobian, L1Config, L1State, L1Transform, augment, init
 from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.envs import BatchedMujocoEnv
 
-CONFIG = L1Config(0.04, epsilon=0.01, action_low=-3.0, action_high=3.0)
+CONFIG = L1Config(0.04, epsilon=0.003, action_low=-3.0, action_high=3.0)
 pendulum = partial(GymEnv, "InvertedPendulum-v5")
 
 
@@ -44,7 +46,8 @@ def actor() -> TensorDictModule:
 
 def with_l1(base: EnvBase, model: EnsembleDynamics, max_steps: int | None = 7) -> TransformedEnv:
     limit = [] if max_steps is None else [StepCounter(max_steps)]
-    return TransformedEnv(base, Compose(DoubleToFloat(), L1Transform(model, CONFIG), *limit))
+    transform = Compose(DoubleToFloat(), L1Transform(model, CONFIG), *limit)
+    return TransformedEnv(base, transform, auto_unwrap=True)
 
 
 def assert_l1_is_right(data: TensorDictBase, model: EnsembleDynamics) -> None:
@@ -72,6 +75,7 @@ def assert_l1_is_right(data: TensorDictBase, model: EnsembleDynamics) -> None:
 
 BASES = {
     "one": pendulum,
+    "own": lambda: BatchedMujocoEnv("inverted_pendulum", num_envs=2),
     "serial": lambda: SerialEnv(2, pendulum),
     "parallel": lambda: ParallelEnv(2, pendulum, mp_start_method="fork"),
 }
@@ -118,13 +122,15 @@ def test_inside_a_batched_environment(kind, model, actor):
 @pytest.mark.parametrize("max_frames", [None, 5])
 def test_in_a_collector(model, actor, max_frames):
     env = with_l1(SerialEnv(2, pendulum), model, max_steps=7 if max_frames is None else None)
-    collector = Collector(
-        env,
-        actor,
-        frames_per_batch=40,
-        total_frames=80,
-        max_frames_per_traj=max_frames or 0,
-    )
+    with set_auto_unwrap_transformed_env(True):  # the collector wraps the environment again
+        collector = Collector(
+            env,
+            actor,
+            frames_per_batch=40,
+            total_frames=80,
+            max_frames_per_traj=max_frames or 0,
+            auto_register_policy_transforms=False,
+        )
     batches = list(collector)
     collector.shutdown()
     # The second batch goes on where the first ended.

@@ -15,7 +15,7 @@ import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_l1.algorithms.metrpo import METRICS
+from torchrl_l1.algorithms.metrpo_metrics import METRICS
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
 

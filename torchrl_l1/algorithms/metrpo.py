@@ -10,9 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
-from statistics import fmean
 from time import perf_counter
 from typing import Any
 
@@ -22,123 +21,14 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
 from torchrl_l1.algorithms.collection import Collection, Perturbation, episode_returns
+from torchrl_l1.algorithms.metrpo_config import METRPOConfig
+from torchrl_l1.algorithms.metrpo_metrics import PolicyStep, fit_metrics, policy_metrics
 from torchrl_l1.algorithms.policy import GaussianPolicy, clipped, make_actor
 from torchrl_l1.algorithms.seeding import seed_streams
 from torchrl_l1.control import L1Config
-from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, FitReport, fit_ensemble, imagine
+from torchrl_l1.dynamics import EnsembleDynamics, fit_ensemble, imagine
 from torchrl_l1.envs import StartStates, get_task
-from torchrl_l1.objectives import LinearFeatureBaseline, TRPOConfig, TRPOReport, trpo_step
-
-METRICS: dict[str, str] = {
-    "iteration": "Outer iteration, from 0.",
-    "real_steps": "Real environment steps so far, the initial random ones included.",
-    "return_mean": "Mean return of this iteration's real episodes: the stochastic policy, with L1 "
-    "if it is on. These episodes join the data. The paper's figure of merit.",
-    "return_std": "Standard deviation over these episodes.",
-    "return_min": "Lowest return among them.",
-    "return_max": "Highest return among them.",
-    "return_deterministic": "Mean return of as many extra episodes with the policy's mean action "
-    "(and L1 if it is on). These do not join the data and are not counted as real steps.",
-    "episodes": "Number of real episodes finished in this iteration.",
-    "non_finite_steps": "Real steps on which the simulator's state became non-finite; they end "
-    "the episode and are kept out of the data.",
-    "model/train_loss": "Mean training loss of a member in the last epoch, normalised units.",
-    "model/validation_loss": "Mean over members of the lowest validation loss, the weights kept.",
-    "model/epochs": "Passes over the training data.",
-    "model/gradient_steps": "Adam steps.",
-    "imagined/return_first": "Mean imagined return before the first TRPO step.",
-    "imagined/return_last": "Mean imagined return before the last TRPO step.",
-    "imagined/left_box": "Share of imagined trajectories that left the box around the data, in "
-    "the last TRPO step. High values mean that the policy exploits the model.",
-    "trpo/kl": "Mean KL divergence per TRPO step, nats.",
-    "trpo/improvement": "Mean gain of the surrogate per TRPO step.",
-    "trpo/accepted": "Share of TRPO steps whose line search succeeded.",
-    "policy/std": "Mean standard deviation of the policy at collection, action units.",
-    "l1/switch_rate": "Switches of the operating point per real step.",
-    "l1/affinization_error": "Mean distance between model and affine model at the tested input, "
-    "raw state units, before switching.",
-    "l1/affinization_error_max": "Largest such distance.",
-    "l1/prediction_error": "Mean norm of the predictor's error x_hat - x, raw state units.",
-    "l1/prediction_error_max": "Largest such norm.",
-    "l1/matched": "Mean norm of the matched part of the estimate, state units per second.",
-    "l1/matched_max": "Largest such norm.",
-    "l1/unmatched": "Mean norm of the unmatched estimate, state units per second. It is "
-    "estimated, not cancelled.",
-    "l1/unmatched_max": "Largest such norm.",
-    "l1/u_a": "Mean norm of the adaptive input, action units.",
-    "l1/u_a_max": "Largest such norm.",
-    "l1/saturation": "Share of steps on which the executed input met a bound.",
-    "l1/ill_conditioned": "Share of steps with a rank-deficient or ill-conditioned Jacobian.",
-}
-"""Every metric that :class:`METRPO` reports, with its meaning. ``l1/...`` only with L1 on."""
-
-
-@dataclass
-class ModelConfig:
-    """Size of the ensemble, see :class:`~torchrl_l1.dynamics.EnsembleDynamics`."""
-
-    members: int = 5
-    hidden: list[int] = field(default_factory=lambda: [256, 256])
-    activation: str = "relu"
-    std_floor: float = 1e-4
-    box_margin: float = 0.5
-
-
-@dataclass
-class PolicyConfig:
-    """The policy's network and its standard deviation at the start of each outer iteration."""
-
-    hidden: list[int] = field(default_factory=lambda: [32, 32])
-    std: float = 1.0
-    reset_std: bool = True
-
-
-@dataclass
-class METRPOConfig:
-    """Settings of :class:`METRPO`.
-
-    Attributes:
-        outer_iterations: rounds of fit, policy improvement and collection.
-        episodes_per_iteration: real episodes per round (and of random data before the first),
-            run side by side.
-        trpo_iterations: TRPO steps per round.
-        imagined_steps: imagined transitions per TRPO step.
-        imagined_horizon: length of an imagined trajectory.
-        imagined_from_data: share of the imagined trajectories that start from states in the
-            real data; the others start as the task does. Where the imagined horizon is shorter
-            than the task's, later states are never imagined otherwise.
-        discount: gamma.
-        gae_lambda: lambda of the generalized advantage estimate.
-        label: action that the model is fitted to: ``nominal`` is the policy's (the paper's
-            choice), ``executed`` what the actuators received after L1.
-        model: see :class:`ModelConfig`.
-        policy: see :class:`PolicyConfig`.
-        fit: see :class:`~torchrl_l1.dynamics.FitConfig`.
-        trpo: see :class:`~torchrl_l1.objectives.TRPOConfig`.
-    """
-
-    outer_iterations: int = 33
-    episodes_per_iteration: int = 6
-    trpo_iterations: int = 20
-    imagined_steps: int = 50_000
-    imagined_horizon: int = 200
-    imagined_from_data: float = 0.0
-    discount: float = 0.99
-    gae_lambda: float = 0.95
-    label: str = "nominal"
-    model: ModelConfig = field(default_factory=ModelConfig)
-    policy: PolicyConfig = field(default_factory=PolicyConfig)
-    fit: FitConfig = field(default_factory=FitConfig)
-    trpo: TRPOConfig = field(default_factory=TRPOConfig)
-
-
-@dataclass
-class PolicyStep:
-    """One TRPO step: its report, and what the trajectories that it learnt from were like."""
-
-    report: TRPOReport
-    imagined_return: float
-    left_box: float
+from torchrl_l1.objectives import LinearFeatureBaseline, trpo_step
 
 
 @dataclass
@@ -266,8 +156,8 @@ class METRPO:
                 "real_steps": (self.iteration + 2) * self.collection.frames,
                 **self.collection.metrics(data),
                 "return_deterministic": deterministic.mean().item(),
-                **_fit_metrics(fit),
-                **_policy_metrics(steps),
+                **fit_metrics(fit),
+                **policy_metrics(steps),
                 "policy/std": self.policy.log_std.detach().exp().mean().item(),
             }
             self.iteration += 1
@@ -373,24 +263,3 @@ def resolve_device(name: str) -> torch.device:
 
 def _standardize(advantage: torch.Tensor) -> torch.Tensor:
     return (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-
-
-def _fit_metrics(fit: FitReport) -> dict[str, float]:
-    return {
-        "model/train_loss": fit.train_loss,
-        "model/validation_loss": fit.validation_loss,
-        "model/epochs": fit.epochs,
-        "model/gradient_steps": fit.gradient_steps,
-    }
-
-
-def _policy_metrics(steps: list[PolicyStep]) -> dict[str, float]:
-    reports = [step.report for step in steps]
-    return {
-        "imagined/return_first": steps[0].imagined_return,
-        "imagined/return_last": steps[-1].imagined_return,
-        "imagined/left_box": steps[-1].left_box,
-        "trpo/kl": fmean(report.kl for report in reports),
-        "trpo/improvement": fmean(report.improvement for report in reports),
-        "trpo/accepted": fmean(report.accepted for report in reports),
-    }

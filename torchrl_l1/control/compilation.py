@@ -15,7 +15,7 @@ CompileMode = bool | Literal["auto"]
 
 
 def compiled(function: FunctionType, mode: CompileMode) -> Callable[..., Any]:
-    """The function, compiled with ``fullgraph=True`` or not.
+    """The function, compiled as one graph or not.
 
     Args:
         function: a pure function of tensors.
@@ -39,8 +39,10 @@ class _Compiled:
     def __init__(self, function: FunctionType, fall_back: bool) -> None:
         self._function = function
         self._fall_back = fall_back
+        # Environments keep their batch size, so graphs with free sizes would only cost: and
+        # torch cannot make dual tensors of them, which forward-mode Jacobians need.
         self._compiled: Callable[..., Any] | None = torch.compile(
-            _with_own_code(function), fullgraph=True
+            _with_own_code(function), fullgraph=True, dynamic=False
         )
         self._called = False
 

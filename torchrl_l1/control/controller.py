@@ -116,6 +116,9 @@ class L1Controller(TensorDictModuleBase):
         layout = Layout(torch.Size([]), observation_dim, action_dim, dtype, dtype)
         return TensorDictPrimer(Composite({self.key: layout.state_spec()}), expand_specs=True)
 
+    # The name under which torchrl.modules.utils.get_primers_from_module looks for it.
+    make_tensordict_primer = make_primer
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """One step of the controller, see the class."""
         u_rl, executed, following = advance(

@@ -96,7 +96,7 @@ def required_entry(tensordict: TensorDictBase, key: NestedKey, owner: str) -> Te
     """The entry, or a ``KeyError`` that says what there is instead."""
     value = tensordict.get(key, None)
     if value is None:
-        found = sorted(str(name) for name in tensordict.keys(include_nested=True))
+        found = sorted(map(str, tensordict.keys(include_nested=isinstance(key, tuple))))
         raise KeyError(f"{owner} found no {key!r} in the tensordict, only {found}")
     return value
 

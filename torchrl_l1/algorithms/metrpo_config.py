@@ -1,0 +1,67 @@
+"""Settings of METRPO."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from torchrl_l1.dynamics import FitConfig
+from torchrl_l1.objectives import TRPOConfig
+
+
+@dataclass
+class ModelConfig:
+    """Size of the ensemble, see :class:`~torchrl_l1.dynamics.EnsembleDynamics`."""
+
+    members: int = 5
+    hidden: list[int] = field(default_factory=lambda: [256, 256])
+    activation: str = "relu"
+    std_floor: float = 1e-4
+    box_margin: float = 0.5
+
+
+@dataclass
+class PolicyConfig:
+    """The policy's network and its standard deviation at the start of each outer iteration."""
+
+    hidden: list[int] = field(default_factory=lambda: [32, 32])
+    std: float = 1.0
+    reset_std: bool = True
+
+
+@dataclass
+class METRPOConfig:
+    """Settings of :class:`~torchrl_l1.algorithms.METRPO`.
+
+    Attributes:
+        outer_iterations: rounds of fit, policy improvement and collection.
+        episodes_per_iteration: real episodes per round (and of random data before the first),
+            run side by side.
+        trpo_iterations: TRPO steps per round.
+        imagined_steps: imagined transitions per TRPO step.
+        imagined_horizon: length of an imagined trajectory.
+        imagined_from_data: share of the imagined trajectories that start from states in the
+            real data; the others start as the task does. Where the imagined horizon is shorter
+            than the task's, later states are never imagined otherwise.
+        discount: gamma.
+        gae_lambda: lambda of the generalized advantage estimate.
+        label: action that the model is fitted to: ``nominal`` is the policy's (the paper's
+            choice), ``executed`` what the actuators received after L1.
+        model: see :class:`ModelConfig`.
+        policy: see :class:`PolicyConfig`.
+        fit: see :class:`~torchrl_l1.dynamics.FitConfig`.
+        trpo: see :class:`~torchrl_l1.objectives.TRPOConfig`.
+    """
+
+    outer_iterations: int = 33
+    episodes_per_iteration: int = 6
+    trpo_iterations: int = 20
+    imagined_steps: int = 50_000
+    imagined_horizon: int = 200
+    imagined_from_data: float = 0.0
+    discount: float = 0.99
+    gae_lambda: float = 0.95
+    label: str = "nominal"
+    model: ModelConfig = field(default_factory=ModelConfig)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    trpo: TRPOConfig = field(default_factory=TRPOConfig)
