@@ -185,3 +185,42 @@ def test_wrong_widths_are_named():
 
     with pytest.raises(ValueError, match=r"Jacobian of shape \(2, 3, 5\), expected \(2, 5, 3\)"):
         ActionJacobian(Transposed())(torch.zeros(2, N), torch.zeros(2, M))
+
+
+def test_one_pass_for_both_actions_is_used_where_the_model_offers_it(net):
+    calls = []
+
+    class Model:
+        def mean_change(self, observation, action):
+            calls.append("mean_change")
+            return net(observation, action)
+
+        def value_and_jacobian(self, observation, action):
+            calls.append("value_and_jacobian")
+            return net(observation, action), by_reverse_mode(net, observation, action)
+
+    class OnePass(Model):
+        def values_and_jacobian(self, observation, action, other):
+            calls.append("values_and_jacobian")
+            return (
+                net(observation, action),
+                by_reverse_mode(net, observation, action),
+                net(observation, other),
+            )
+
+    observation, action = data(4)
+    other = action + 1
+    expected = (
+        net(observation, action),
+        by_reverse_mode(net, observation, action),
+        net(observation, other),
+    )
+    for model, made in (
+        (Model(), ["value_and_jacobian", "mean_change"]),
+        (OnePass(), ["values_and_jacobian"]),
+    ):
+        calls.clear()
+        results = ActionJacobian(model).values_and_jacobian(observation, action, other)
+        assert calls == made
+        for value, want in zip(results, expected, strict=True):
+            torch.testing.assert_close(value, want)

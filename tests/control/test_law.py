@@ -256,3 +256,26 @@ def test_zero_bandwidth_estimates_without_acting():
     u, following, _ = step(config, state, *inputs)
     torch.testing.assert_close(u, inputs[1], atol=0, rtol=0)
     assert following.sigma_m.abs().min() > 0
+
+
+def test_shapes_that_do_not_fit_are_named():
+    config = L1Config(0.05)
+    state = init([3], 4, 2)
+    good = {
+        "observation": torch.zeros(3, 4),
+        "u_rl": torch.zeros(3, 2),
+        "drift": torch.zeros(3, 4),
+        "jacobian": torch.zeros(3, 4, 2),
+        "restart": torch.zeros(3, 1, dtype=torch.bool),
+    }
+    step(config, state, **good)
+    bad = {
+        "observation": torch.zeros(3, 5),
+        "u_rl": torch.zeros(2),
+        "drift": torch.zeros(1, 4),
+        "jacobian": torch.zeros(3, 2, 4),
+        "restart": torch.zeros(3, dtype=torch.bool),
+    }
+    for name, value in bad.items():
+        with pytest.raises(ValueError, match=f"^{name} has shape"):
+            step(config, state, **(good | {name: value}))

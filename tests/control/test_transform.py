@@ -85,8 +85,13 @@ def test_bounds_are_the_action_specs_unless_given():
     assert executed(L1Transform(make_model(), dt=0.05, action_high=0.5)).max() == 0.5
     inf = float("inf")
     assert executed(L1Transform(make_model(), dt=0.05, action_high=inf)).max() >= 5.0
-    # The spec that counts is the one at L1's place in the chain.
+    # The spec that counts is the one at L1's place in the chain, also when that changes.
     assert executed(L1Transform(make_model(), dt=0.05), ActionScaling()).max() == 1.0
+    env = TransformedEnv(GymEnv("Pendulum-v1"), L1Transform(make_model(), dt=0.05))
+    actor = TensorDictModule(lambda x: 5 + 0 * x[..., :1], ["observation"], ["action"])
+    assert env.rollout(3, actor)["next", "l1", "u_exec"].max() == 2.0
+    env.insert_transform(0, ActionScaling())
+    assert env.rollout(3, actor)["next", "l1", "u_exec"].max() == 1.0
 
 
 def test_diagnostics_can_be_left_out():

@@ -77,7 +77,7 @@ BASES = {
     "one": pendulum,
     "own": lambda: BatchedMujocoEnv("inverted_pendulum", num_envs=2),
     "serial": lambda: SerialEnv(2, pendulum),
-    "parallel": lambda: ParallelEnv(2, pendulum, mp_start_method="fork"),
+    "parallel": lambda: ParallelEnv(2, pendulum),
 }
 
 

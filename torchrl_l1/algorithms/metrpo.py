@@ -134,6 +134,8 @@ class METRPO:
             )
             clock.append(perf_counter())
 
+            if config.policy.normalize:
+                self.policy.normalizer.fit(self.buffer[:]["observation"])
             if config.policy.reset_std:
                 self.policy.reset_std(config.policy.std)
             steps = []
@@ -191,7 +193,13 @@ class METRPO:
         with torch.no_grad():
             value = self.baseline(observation, step)
             done = trajectories["next", "done"]
-            # No bootstrap at the imagined horizon: the baseline knows the time.
+            # No bootstrap at the imagined horizon: the baseline knows the time. What follows an
+            # exit from the box is unknown; to call it zero would reward leaving wherever
+            # rewards are negative, so the value of the last state inside stands for it.
+            terminated = torch.zeros_like(done)
+            terminated[:, -1] = True
+            if config.box_exit == "fail":
+                terminated |= trajectories["next", "terminated"]
             advantage, target = vec_generalized_advantage_estimate(
                 config.discount,
                 config.gae_lambda,
@@ -199,7 +207,7 @@ class METRPO:
                 torch.cat([value[:, 1:], torch.zeros_like(value[:, :1])], dim=1),
                 trajectories["next", "reward"],
                 done=done,
-                terminated=done,
+                terminated=terminated,
             )
         valid = trajectories["valid"].squeeze(-1)
         samples = TensorDict(

@@ -21,11 +21,20 @@ class ModelConfig:
 
 @dataclass
 class PolicyConfig:
-    """The policy's network and its standard deviation at the start of each outer iteration."""
+    """The policy.
+
+    Attributes:
+        hidden: widths of the hidden layers.
+        std: initial standard deviation, action units.
+        reset_std: whether to go back to it at the start of each outer iteration.
+        normalize: whether the network sees normalised observations; the statistics are those
+            of all real data and are renewed in each outer iteration.
+    """
 
     hidden: list[int] = field(default_factory=lambda: [32, 32])
     std: float = 1.0
     reset_std: bool = True
+    normalize: bool = False
 
 
 @dataclass
@@ -42,6 +51,9 @@ class METRPOConfig:
         imagined_from_data: share of the imagined trajectories that start from states in the
             real data; the others start as the task does. Where the imagined horizon is shorter
             than the task's, later states are never imagined otherwise.
+        box_exit: what an imagined trajectory that leaves the box around the data is worth from
+            there on: nothing (``fail``, the paper's MDP), or what the baseline says of its last
+            state inside (``truncate``).
         discount: gamma.
         gae_lambda: lambda of the generalized advantage estimate.
         label: action that the model is fitted to: ``nominal`` is the policy's (the paper's
@@ -58,6 +70,7 @@ class METRPOConfig:
     imagined_steps: int = 50_000
     imagined_horizon: int = 200
     imagined_from_data: float = 0.0
+    box_exit: str = "truncate"
     discount: float = 0.99
     gae_lambda: float = 0.95
     label: str = "nominal"

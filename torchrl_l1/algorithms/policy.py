@@ -10,9 +10,13 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
+from torchrl_l1.dynamics import Normalizer
+
 
 class GaussianPolicy(nn.Module):
     """Tanh network for the mean, a free parameter for the logarithm of the standard deviation.
+
+    Observations pass a normaliser first, which is the identity until it is fitted.
 
     Args:
         observation_dim: number of observations, n.
@@ -25,6 +29,7 @@ class GaussianPolicy(nn.Module):
         self, observation_dim: int, action_dim: int, hidden: Sequence[int], std: float = 1.0
     ) -> None:
         super().__init__()
+        self.normalizer = Normalizer(observation_dim, std_floor=1e-2)
         layers: list[nn.Module] = []
         widths = [observation_dim, *hidden]
         for fan_in, fan_out in pairwise(widths):
@@ -44,7 +49,7 @@ class GaussianPolicy(nn.Module):
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation ``(..., m)`` for observations ``(..., n)``."""
-        loc = self.mean(observation)
+        loc = self.mean(self.normalizer.normalize(observation))
         return loc, self.log_std.exp().expand_as(loc)
 
     def sample(self, observation: Tensor) -> Tensor:

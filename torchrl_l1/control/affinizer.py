@@ -75,8 +75,8 @@ class Affinizer(TensorDictModuleBase):
         self.action_key = action_key
         self.key = key
         self._action_dim = declared_dimension(self.model, "action_dim", action_dim)
-        self.in_keys = [observation_key, action_key]
-        self.out_keys = [(key, "drift"), (key, "jacobian")]
+        self.in_keys: list[NestedKey] = [observation_key, action_key]
+        self.out_keys: list[NestedKey] = [(key, "drift"), (key, "jacobian")]
         if epsilon is not None:
             self.in_keys += [(key, name) for name in _STATE]
             self.out_keys += [(key, "switch"), (key, "error")]

@@ -2,13 +2,31 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 from torchrl_l1.control import law
-from torchrl_l1.control.affine import linearize, relinearize, switching_law
+from torchrl_l1.control.affine import Linearization, linearize, relinearize, switching_law
 from torchrl_l1.control.jacobian import ActionJacobian
 from torchrl_l1.control.law import L1Config, L1Diagnostics, L1State
+
+
+class Assessment(NamedTuple):
+    """Outcome of the switching law, before the operating point moves.
+
+    Attributes:
+        u_rl: the policy's action within its bounds ``(..., m)``.
+        current: the model around the remembered operating point.
+        switch: whether that point must move ``(..., 1)``, bool.
+        error: error of the affine model at the tested input ``(..., 1)``, state units.
+    """
+
+    u_rl: Tensor
+    current: Linearization
+    switch: Tensor
+    error: Tensor
 
 
 def augment(
@@ -45,30 +63,57 @@ def augment(
         >>> state.x_hat.squeeze(-1)
         tensor([0.9000, 0.9000, 0.9000])
     """
+    assessment = assess(config, model, state, observation, u_rl)
+    selected = relinearize(
+        model, observation, assessment.current, assessment.u_rl, assessment.switch
+    )
+    return conclude(config, state, observation, assessment, selected)
+
+
+def assess(
+    config: L1Config,
+    model: ActionJacobian,
+    state: L1State,
+    observation: Tensor,
+    u_rl: Tensor,
+) -> Assessment:
+    """First part of :func:`augment`: affinize at the remembered point and test the result."""
     u_rl = law.saturate(config, u_rl)
     u_bar = torch.where(state.started, state.u_bar, u_rl)
-    current = linearize(model, observation, u_bar)
-
-    if config.switch_on == "policy":
-        tested = u_rl
-    elif config.filter_input == "previous":
-        # This step's input does not depend on the operating point: it is already known.
-        adapted = law.saturate(config, u_rl - law.filtered(config, state.q, state.sigma_m))
-        tested = torch.where(state.started, adapted, u_rl)
-    else:
+    if config.switch_on == "executed" and config.filter_input == "current":
+        # The executed input depends on the Jacobian, through this step's estimate.
+        current = linearize(model, observation, u_bar)
         tested = law.step(config, state, observation, u_rl, *current.affine())[0]
-    switch, error = switching_law(current, tested, model.value(observation, tested), config.epsilon)
+        value = model.value(observation, tested)
+    else:
+        tested = u_rl
+        if config.switch_on == "executed":
+            # It does not depend on the operating point: the filter's next state is known.
+            adapted = law.saturate(config, u_rl - law.filtered(config, state.q, state.sigma_m))
+            tested = torch.where(state.started, adapted, u_rl)
+        at_u_bar, jacobian, value = model.values_and_jacobian(observation, u_bar, tested)
+        current = Linearization(u_bar, at_u_bar, jacobian)
+    switch, error = switching_law(current, tested, value, config.epsilon)
     # Rounding may separate two evaluations at the same input; a first step never switches.
-    switch = switch & state.started
-    selected = relinearize(model, observation, current, u_rl, switch)
+    return Assessment(u_rl, current, switch & state.started, error)
 
-    restart = switch if config.on_switch == "reset" else None
-    u, next_state, diagnostics = law.step(
-        config, state, observation, u_rl, *selected.affine(), restart
+
+def conclude(
+    config: L1Config,
+    state: L1State,
+    observation: Tensor,
+    assessment: Assessment,
+    selected: Linearization,
+) -> tuple[Tensor, L1State, L1Diagnostics]:
+    """Last part of :func:`augment`: the adaptive law around the selected operating point."""
+    restart = assessment.switch if config.on_switch == "reset" else None
+    u, following, diagnostics = law.step(
+        config, state, observation, assessment.u_rl, *selected.affine(), restart
     )
-    finite = next_state.started
-    next_state = next_state._replace(
-        u_bar=torch.where(finite, selected.u_bar, 0.0), n_switch=state.n_switch + switch
+    finite = following.started
+    following = following._replace(
+        u_bar=torch.where(finite, selected.u_bar, 0.0),
+        n_switch=state.n_switch + assessment.switch,
     )
-    error = torch.where(finite & state.started, error, 0.0)
-    return u, next_state, diagnostics._replace(switch=switch, affinization_error=error)
+    error = torch.where(finite & state.started, assessment.error, 0.0)
+    return u, following, diagnostics._replace(switch=assessment.switch, affinization_error=error)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDict
@@ -22,7 +22,9 @@ class DynamicsModel(Protocol):
 
     A model may also have ``value_and_jacobian(observation, action)``, which returns the same
     change ``(..., n)`` together with its derivative with respect to the action ``(..., n, m)``
-    in raw units; it is then used in place of automatic differentiation.
+    in raw units; it is then used in place of automatic differentiation. With
+    ``values_and_jacobian(observation, action, other)`` it gives in one pass also the change at a
+    second action, ``(..., n)``, which the switching law needs.
     """
 
     def mean_change(self, observation: Tensor, action: Tensor) -> Tensor:
@@ -77,6 +79,8 @@ class ActionJacobian:
         self.predicts = predicts
         self.ensemble_dim = ensemble_dim
         self.analytic = callable(getattr(dynamics, "value_and_jacobian", None))
+        one_pass = getattr(dynamics, "values_and_jacobian", None)
+        self._values_and_jacobian = one_pass if self.analytic else None
         self._predict: ChangeFunction
         if isinstance(dynamics, DynamicsModel):
             if predicts != "change" or ensemble_dim is not None or out_key is not None:
@@ -152,15 +156,24 @@ class ActionJacobian:
 
     __call__ = value_and_jacobian
 
+    def values_and_jacobian(
+        self, observation: Tensor, action: Tensor, other: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Value and Jacobian at ``action`` and the value at ``other``, of the same shape."""
+        if self._values_and_jacobian is not None:
+            return self._values_and_jacobian(observation, action, other)
+        return *self.value_and_jacobian(observation, action), self.value(observation, other)
+
     def _forward_mode(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        def push_forward(tangent: Tensor) -> tuple[Tensor, Tensor]:
-            value, column = torch.func.jvp(
+        def push_forward(tangent: Tensor) -> tuple[Tensor, ...]:
+            return torch.func.jvp(
                 lambda u: self.value(observation, u), (action,), (tangent.expand_as(action),)
             )
-            return value, column
 
         basis = torch.eye(action.shape[-1], dtype=action.dtype, device=action.device)
-        value, jacobian = torch.func.vmap(push_forward, out_dims=(None, -1))(basis)
+        # The value does not depend on the tangent: it comes out once, without a new dimension.
+        out_dims: Any = (None, -1)
+        value, jacobian = torch.func.vmap(push_forward, out_dims=out_dims)(basis)
         return value, jacobian
 
 

@@ -165,6 +165,9 @@ def step(
         the executed input ``(..., m)``, the next state and the diagnostics (the two of the
         switching law, which this function does not evaluate, hold ``restart`` and zeros).
 
+    Raises:
+        ValueError: if a shape does not fit the state's.
+
     Examples:
         >>> config = L1Config(0.04, action_low=-1.0, action_high=1.0)
         >>> state = init([2], observation_dim=3, action_dim=1)
@@ -175,11 +178,11 @@ def step(
         >>> state.x_hat[0]
         tensor([0.5000, 0.5000, 0.5000])
     """
+    _check_shapes(state, observation, u_rl, drift, jacobian, restart)
     fresh = ~state.started if restart is None else ~state.started | restart
     u_rl = saturate(config, u_rl)
     x_hat = torch.where(fresh, observation, state.x_hat)
     q = torch.where(fresh, 0.0, state.q)
-    previous_sigma_m = torch.where(fresh, 0.0, state.sigma_m)
 
     # State prediction error, estimate and its matched part. Everything is in state units per
     # step here: this is T sigma_hat, so that no division by a small T enters the state.
@@ -188,8 +191,10 @@ def step(
     sigma_m, ill_conditioned = solve_matched(jacobian, estimate)
 
     # Control input.
-    filter_input = previous_sigma_m if config.filter_input == "previous" else sigma_m
-    q = filtered(config, q, filter_input)
+    if config.filter_input == "previous":
+        q = filtered(config, q, torch.where(fresh, 0.0, state.sigma_m))
+    else:
+        q = filtered(config, q, sigma_m)
     unbounded = u_rl - q
     u = saturate(config, unbounded)
 
@@ -202,11 +207,13 @@ def step(
         torch.stack([x_err, effect_sigma_m, estimate - effect_sigma_m], dim=-2), dim=-1
     )
     norms = torch.where(finite, norms, 0.0)
+    rates = norms[..., 1:] / config.dt
+    # The least squares gives finite numbers whatever it gets, so q and sigma_m need no care.
     next_state = L1State(
         x_hat=torch.where(finite, x_hat, 0.0),
         u_bar=state.u_bar,
-        q=torch.where(finite, q, 0.0),
-        sigma_m=torch.where(finite, sigma_m, 0.0),
+        q=q,
+        sigma_m=sigma_m,
         n_switch=state.n_switch,
         started=finite,
     )
@@ -214,14 +221,37 @@ def step(
         switch=torch.zeros_like(finite) if restart is None else restart,
         affinization_error=torch.zeros_like(norms[..., :1]),
         prediction_error=norms[..., :1],
-        matched=norms[..., 1:2] / config.dt,
-        unmatched=norms[..., 2:] / config.dt,
-        u_a=torch.linalg.vector_norm(next_state.q, dim=-1, keepdim=True),
+        matched=rates[..., :1],
+        unmatched=rates[..., 1:],
+        u_a=torch.linalg.vector_norm(q, dim=-1, keepdim=True),
         saturation=((u != unbounded) & finite).to(u.dtype).mean(-1, keepdim=True),
         ill_conditioned=ill_conditioned,
         non_finite=~finite,
     )
     return torch.where(finite, u, u_rl), next_state, diagnostics
+
+
+def _check_shapes(
+    state: L1State,
+    observation: Tensor,
+    u_rl: Tensor,
+    drift: Tensor,
+    jacobian: Tensor,
+    restart: Tensor | None,
+) -> None:
+    n, m = state.x_hat.shape, state.q.shape
+    for name, value, expected in (
+        ("observation", observation, n),
+        ("u_rl", u_rl, m),
+        ("drift", drift, n),
+        ("jacobian", jacobian, (*n, m[-1])),
+        ("restart", restart, state.started.shape),
+    ):
+        # Broadcasting would hide some of these.
+        if value is not None and value.shape != expected:
+            raise ValueError(
+                f"{name} has shape {tuple(value.shape)}, expected {tuple(expected)} as the state"
+            )
 
 
 def _like(tensor: Tensor, value: Scalars) -> Tensor | float:

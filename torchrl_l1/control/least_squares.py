@@ -52,24 +52,19 @@ def solve_matched(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
     """
     if jacobian.shape[-1] == 1:
         solution, ill_conditioned = _solve_one_column(jacobian, residual)
-    else:
-        solution, ill_conditioned = _solve_columns(jacobian, residual)
+        return torch.where(solution.isfinite(), solution, 0.0), ill_conditioned
+    solution, ill_conditioned = _solve_columns(jacobian, residual)
     finite = solution.isfinite().all(-1, keepdim=True)
     return torch.where(finite, solution, 0.0), ill_conditioned
 
 
-def _smallest_length(dtype: torch.dtype) -> float:
-    # Its square must not underflow.
-    return float(torch.finfo(dtype).tiny) ** 0.5
-
-
 def _solve_one_column(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
     column = jacobian.squeeze(-1)
-    length = torch.linalg.vector_norm(column, dim=-1, keepdim=True)
-    usable = (length > _smallest_length(length.dtype)) & length.isfinite()
-    # Normalising first keeps the squares of very short columns from underflowing.
-    unit = column / torch.where(usable, length, torch.inf)
-    return (unit * residual).sum(-1, keepdim=True) / torch.where(usable, length, 1.0), ~usable
+    square = column.square().sum(-1, keepdim=True)
+    # A comparison with what is not a number is false.
+    usable = (square > torch.finfo(square.dtype).tiny) & (square < torch.inf)
+    projection = (column * residual).sum(-1, keepdim=True)
+    return projection / torch.where(usable, square, torch.inf), ~usable
 
 
 def _solve_columns(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
@@ -90,3 +85,8 @@ def _solve_columns(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
     # Written so that a pivot that is not a number is flagged.
     well_conditioned = (pivots > tolerance) & (info[0].unsqueeze(-1) == 0) & longest.isfinite()
     return torch.where(well_conditioned, plain, damped) / scale, ~well_conditioned
+
+
+def _smallest_length(dtype: torch.dtype) -> float:
+    # Its square must not underflow.
+    return float(torch.finfo(dtype).tiny) ** 0.5

@@ -12,6 +12,7 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_l1.control import law
+from torchrl_l1.control.config import Scalars
 from torchrl_l1.control.law import L1Config, L1Diagnostics, L1State
 
 L1_KEY = "l1"
@@ -31,7 +32,7 @@ class Layout:
         dtype: type in which the controller computes.
         action_dtype: type of the action.
         device: the environment's device.
-        low: lower action bound of the action spec, per dimension; ``None`` if unbounded.
+        low: lower action bound of the action spec; ``None`` if it has none.
         high: upper action bound.
     """
 
@@ -41,8 +42,8 @@ class Layout:
     dtype: torch.dtype
     action_dtype: torch.dtype
     device: torch.device | None = None
-    low: tuple[float, ...] | None = None
-    high: tuple[float, ...] | None = None
+    low: Scalars | None = None
+    high: Scalars | None = None
 
     @classmethod
     def of(
@@ -139,7 +140,7 @@ def _vector_spec(env: EnvBase, kind: str, key: NestedKey) -> TensorSpec:
     return spec
 
 
-def _bounds(action: TensorSpec) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
+def _bounds(action: TensorSpec) -> tuple[Scalars | None, Scalars | None]:
     if not isinstance(action, Bounded):
         return None, None
     low, high = (
@@ -151,4 +152,10 @@ def _bounds(action: TensorSpec) -> tuple[tuple[float, ...] | None, tuple[float, 
             "the environments have different action bounds: give L1 the bounds to use as "
             "action_low and action_high"
         )
-    return tuple(low[0].tolist()), tuple(high[0].tolist())
+    return _scalars(low[0]), _scalars(high[0])
+
+
+def _scalars(bound: Tensor) -> Scalars:
+    # One number costs nothing per step; a tuple becomes a tensor each time.
+    values = tuple(bound.tolist())
+    return values[0] if values.count(values[0]) == len(values) else values

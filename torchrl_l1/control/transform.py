@@ -101,12 +101,18 @@ class L1Transform(Transform):
         self.diagnostics = diagnostics
         self.dtype = self.model.dtype if dtype is None else dtype
         self._layout: Layout | None = None
+        self._step_config: L1Config | None = None
         self._step_function: StepFunction | None = None
 
     def set_container(self, container: Transform | EnvBase) -> None:
         """Attach to an environment, whose specs then decide widths and bounds."""
         self._layout = None
         super().set_container(container)
+
+    def empty_cache(self) -> None:
+        """Forget what the specs decided: a transform before this one may have changed them."""
+        self._layout = None
+        super().empty_cache()
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the controller's state and signals."""
@@ -182,13 +188,16 @@ class L1Transform(Transform):
             config = layout.bounded(self.config)
             config.check_dimensions(layout.observation_dim, layout.action_dim)
             self.model.check_dimensions(layout.observation_dim, layout.action_dim)
-            self._step_function = make_step(config, self.model, self.compile_mode)
+            if self._step_function is None or config != self._step_config:
+                self._step_function = make_step(config, self.model, self.compile_mode)
+                self._step_config = config
             self._layout = layout
         return self._layout
 
     def _check_order(self) -> None:
         chain = list(_flatten(self.container.transform))
-        for later in chain[chain.index(self) + 1 :]:
+        position = chain.index(self) if self in chain else len(chain)
+        for later in chain[position + 1 :]:
             if self.observation_key in later.out_keys:
                 raise ValueError(
                     f"{type(later).__name__} comes after L1Transform and overwrites "
