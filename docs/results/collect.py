@@ -88,7 +88,9 @@ def curves(
         axis.plot(steps, run.column("return_deterministic"), "--", color=shade, alpha=0.6)
     if symlog:
         axis.set_yscale("symlog", linthresh=0.1)
-    axis.set(xlabel="real environment steps", ylabel="return (solid stochastic, dashed mean action)")
+    axis.set(
+        xlabel="real environment steps", ylabel="return (solid stochastic, dashed mean action)"
+    )
     handles, names = axis.get_legend_handles_labels()
     unique = dict(zip(names, handles, strict=True))
     axis.legend(unique.values(), unique.keys())
@@ -105,7 +107,14 @@ def labels(folders: Sequence[str]) -> None:
         cells = [returns[0], min(returns[-5:]), returns[-1], run.column("return_deterministic")[-1]]
         rates = run.column("l1/switch_rate")
         rows.append([run.label, run.seed, *(f"{c:.3g}" for c in cells), f"{1000 * rates[-1]:.3g}"])
-    header = ["label", "seed", "first iteration", "worst of the last five", "last", "last, mean action"]
+    header = [
+        "label",
+        "seed",
+        "first iteration",
+        "worst of the last five",
+        "last",
+        "last, mean action",
+    ]
     colors = {"executed": "tab:blue", "nominal": "tab:red"}
     curves("labels", runs, lambda run: colors[run.label], "label", symlog=True)
     write("labels", [*header, "switches per 1000 steps, last"], rows, environment(runs[0]))

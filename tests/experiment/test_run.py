@@ -98,6 +98,12 @@ def test_bad_settings_are_refused_before_anything_is_written(
 ) -> None:
     for override, message in [
         ("label=both", "label must be"),
+        ("box_exit=bounce", "box_exit must be"),
+        ("trpo_iterations=0", "trpo_iterations must be"),
+        ("imagined_horizon=1000", "imagined_steps"),
+        ("imagined_from_data=1.5", "imagined_from_data"),
+        ("fit.batch_size=0", r"fit\.batch_size"),
+        ("fit.validation_fraction=1.0", r"fit\.validation_fraction"),
         ("task=pendulum", "Unknown task"),
         ("wandb.mode=loud", "wandb.mode"),
         ("l1.on_switch=forget", "on_switch"),

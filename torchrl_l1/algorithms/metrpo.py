@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
+from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from torchrl_l1.algorithms.collection import Collection, Perturbation, episode_returns
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig
@@ -67,8 +67,6 @@ class METRPO:
         device: str = "cpu",
         on_phase: Callable[[str], None] | None = None,
     ) -> None:
-        if config.label not in ("nominal", "executed"):
-            raise ValueError(f"label must be 'nominal' or 'executed', got {config.label!r}")
         self.config, self.seed = config, seed
         self.device = resolve_device(device)
         self.on_phase = on_phase or (lambda phase: None)
@@ -200,7 +198,7 @@ class METRPO:
             terminated[:, -1] = True
             if config.box_exit == "fail":
                 terminated |= trajectories["next", "terminated"]
-            advantage, target = vec_generalized_advantage_estimate(
+            advantage, target = generalized_advantage_estimate(
                 config.discount,
                 config.gae_lambda,
                 value,

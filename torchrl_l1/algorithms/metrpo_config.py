@@ -78,3 +78,27 @@ class METRPOConfig:
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     trpo: TRPOConfig = field(default_factory=TRPOConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse settings that could only fail later.
+
+        Raises:
+            ValueError: naming the setting.
+        """
+        choices = {"label": ("nominal", "executed"), "box_exit": ("truncate", "fail")}
+        for name, allowed in choices.items():
+            if getattr(self, name) not in allowed:
+                raise ValueError(
+                    f"{name} must be {' or '.join(map(repr, allowed))}, got {getattr(self, name)!r}"
+                )
+        counts = ("outer_iterations", "episodes_per_iteration", "trpo_iterations")
+        for name in (*counts, "imagined_horizon"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.imagined_steps < self.imagined_horizon:
+            raise ValueError(
+                f"imagined_steps ({self.imagined_steps}) must hold at least one trajectory of "
+                f"imagined_horizon ({self.imagined_horizon}) steps"
+            )
+        if not 0 <= self.imagined_from_data <= 1:
+            raise ValueError(f"imagined_from_data must be in [0, 1], got {self.imagined_from_data}")

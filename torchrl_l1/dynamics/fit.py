@@ -37,6 +37,22 @@ class FitConfig:
     validation_fraction: float = 0.1
     weight_penalty: float = 0.0
 
+    def __post_init__(self) -> None:
+        """Refuse settings that could only fail later.
+
+        Raises:
+            ValueError: naming the setting.
+        """
+        for name in ("batch_size", "max_epochs", "max_gradient_steps", "patience"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"fit.{name} must be at least 1, got {getattr(self, name)}")
+        if not 0 < self.validation_fraction < 1:
+            raise ValueError(
+                f"fit.validation_fraction must be between 0 and 1, got {self.validation_fraction}"
+            )
+        if self.learning_rate <= 0:
+            raise ValueError(f"fit.learning_rate must be positive, got {self.learning_rate}")
+
 
 @dataclass
 class FitReport:

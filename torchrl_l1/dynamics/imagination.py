@@ -57,8 +57,9 @@ def imagine(
         # A trajectory that left stays where it last was inside, so that nothing overflows.
         observation = torch.where(within[:, None], successor, observation)
         observations[t + 1] = observation
-    left = ~inside
-    valid = (left.long().cumsum(0) - left.long()) == 0
+    outside = (~inside).long()
+    valid = (outside.cumsum(0) - outside) == 0
+    left = valid & ~inside
     done = left.clone()
     done[-1] = True
     columns = {
