@@ -28,7 +28,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     if rest and options.command != "run":
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     # Imports wait until the arguments are known to be right: torch takes seconds to load.
-    from torchrl_l1.experiment.errors import USER_ERRORS
+    from torchrl_l1.experiment.errors import USER_ERRORS, message
 
     try:
         if options.command == "run":
@@ -49,13 +49,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     except USER_ERRORS as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
-        print(f"torchrl-l1 {options.command}: {_message(error)}", file=sys.stderr)
+        print(f"torchrl-l1 {options.command}: {message(error)}", file=sys.stderr)
+        print("(HYDRA_FULL_ERROR=1 shows where it was raised)", file=sys.stderr)
         sys.exit(1)
-
-
-def _message(error: BaseException) -> str:
-    # KeyError quotes its message like a key.
-    return str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
 
 
 def _run_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

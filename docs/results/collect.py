@@ -117,7 +117,12 @@ def labels(folders: Sequence[str]) -> None:
     ]
     colors = {"executed": "tab:blue", "nominal": "tab:red"}
     curves("labels", runs, lambda run: colors[run.label], "label", symlog=True)
-    write("labels", [*header, "switches per 1000 steps, last"], rows, environment(runs[0]))
+    write(
+        "labels",
+        [*header, "last, mean action", "switches per 1000 steps, last"],
+        rows,
+        environment(runs[0]),
+    )
 
 
 def half_cheetah(folders: Sequence[str]) -> None:

@@ -27,6 +27,7 @@ class NumpyL1:
     on_switch: str = "keep"
     switch_on: str = "executed"
     filter_input: str = "previous"
+    project: bool = True
     x_hat: np.ndarray | None = None
     u_bar: np.ndarray | None = None
     q: Any = 0.0
@@ -54,6 +55,10 @@ class NumpyL1:
     ) -> np.ndarray:
         """Algorithm 1 with the affine model x' = x + drift + jac u."""
         sigma_hat, sigma_m, sigma_um = self.estimate(x, jac)
+        if self.project:
+            # A matched disturbance of more than the range of the actions cannot be cancelled.
+            width = self.high - self.low
+            sigma_m = np.clip(sigma_m, -width, width)
         source = self.sigma_m if self.filter_input == "previous" else sigma_m
         gain = self.omega * np.eye(jac.shape[1])
         q = self.q + (-gain @ self.q + gain @ source) * self.dt

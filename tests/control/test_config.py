@@ -21,6 +21,7 @@ def test_presets_are_those_of_the_paper_and_of_the_released_code():
         "current",
     )
     assert reference.epsilon == 3.0
+    assert paper.project and not reference.project
     assert paper.filter_gain == reference.filter_gain == 0.35
     assert L1Config.reference(0.04, on_switch="keep").on_switch == "keep"
 
@@ -65,6 +66,7 @@ def test_gains_at_the_default_rate():
         ({"action_low": (-1.0, 2.0), "action_high": 1.0}, "action_low must be below"),
         ({"action_low": (-1.0, -1.0), "action_high": (1.0,) * 3}, "2 entries and action_high has"),
         ({"action_low": float("nan")}, "action_low must be a number"),
+        ({"project": "yes"}, "project must be True or False"),
         ({"action_low": [True]}, "action_low must be a number"),
     ],
 )

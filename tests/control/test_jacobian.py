@@ -5,7 +5,14 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 
-from torchrl_l1.control import ActionJacobian, DynamicsModel
+from torchrl_l1.control import (
+    ActionJacobian,
+    Affinizer,
+    DynamicsModel,
+    L1Config,
+    L1Controller,
+    L1Transform,
+)
 from torchrl_l1.dynamics import EnsembleDynamics
 
 N, M = 5, 3
@@ -187,40 +194,54 @@ def test_wrong_widths_are_named():
         ActionJacobian(Transposed())(torch.zeros(2, N), torch.zeros(2, M))
 
 
-def test_one_pass_for_both_actions_is_used_where_the_model_offers_it(net):
-    calls = []
+@pytest.mark.parametrize(
+    ("observation_key", "out_key", "predicts"),
+    [
+        ("observation", ("next", "observation"), "next_observation"),
+        ("observation", "observation", "next_observation"),
+        (("agent", "pose"), ("next", "agent", "pose"), "next_observation"),
+        ("observation", "change", "change"),
+        ("observation", ("next", "change"), "change"),
+    ],
+)
+def test_the_out_key_tells_what_a_module_predicts(net, observation_key, out_key, predicts):
+    following = predicts == "next_observation"
+    module = TensorDictModule(
+        lambda x, u: net(x, u) + (x if following else 0), [observation_key, "action"], [out_key]
+    )
+    observation, action = data(4)
+    model = ActionJacobian(module, observation_key=observation_key)
+    assert model.predicts == predicts
+    torch.testing.assert_close(model.value(observation, action), net(observation, action))
+    # What is said counts more than what is inferred.
+    other = "change" if following else "next_observation"
+    assert ActionJacobian(module, observation_key=observation_key, predicts=other).predicts == other
+    assert ActionJacobian(net).predicts == "change"
 
-    class Model:
-        def mean_change(self, observation, action):
-            calls.append("mean_change")
-            return net(observation, action)
 
-        def value_and_jacobian(self, observation, action):
-            calls.append("value_and_jacobian")
-            return net(observation, action), by_reverse_mode(net, observation, action)
+def test_the_named_one_of_several_out_keys_tells_too(net):
+    module = TensorDictModule(
+        lambda x, u: (x + net(x, u), x.sum(-1, True)),
+        ["observation", "action"],
+        [("next", "observation"), "reward"],
+    )
+    observation, action = data(4)
+    model = ActionJacobian(module, out_key=("next", "observation"))
+    torch.testing.assert_close(model.value(observation, action), net(observation, action))
 
-    class OnePass(Model):
-        def values_and_jacobian(self, observation, action, other):
-            calls.append("values_and_jacobian")
-            return (
-                net(observation, action),
-                by_reverse_mode(net, observation, action),
-                net(observation, other),
-            )
+
+def test_every_face_takes_what_the_model_predicts(net):
+    def following(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        return x + net(x, u)
 
     observation, action = data(4)
-    other = action + 1
-    expected = (
-        net(observation, action),
-        by_reverse_mode(net, observation, action),
-        net(observation, other),
+    config = L1Config(0.1)
+    faces = (
+        L1Transform(following, config, predicts="next_observation"),
+        L1Controller(following, config, predicts="next_observation"),
+        Affinizer(following, predicts="next_observation"),
     )
-    for model, made in (
-        (Model(), ["value_and_jacobian", "mean_change"]),
-        (OnePass(), ["values_and_jacobian"]),
-    ):
-        calls.clear()
-        results = ActionJacobian(model).values_and_jacobian(observation, action, other)
-        assert calls == made
-        for value, want in zip(results, expected, strict=True):
-            torch.testing.assert_close(value, want)
+    for face in faces:
+        torch.testing.assert_close(face.model.value(observation, action), net(observation, action))
+    with pytest.raises(ValueError, match="ActionJacobian has predicts='change'"):
+        L1Transform(ActionJacobian(net), config, predicts="next_observation")

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchrl_l1.control import L1Config, L1State, init, step
-from torchrl_l1.control.law import saturate
+from torchrl_l1.control.law import project, saturate
 
 
 def well_conditioned(rng: np.random.Generator, *shape: int) -> np.ndarray:
@@ -30,9 +30,10 @@ def tensors(*arrays: np.ndarray) -> list[torch.Tensor]:
     filter_input=st.sampled_from(["current", "previous"]),
     bound=st.sampled_from([None, 0.5]),
     scalar_rate=st.booleans(),
+    projected=st.booleans(),
 )
 def test_agrees_with_the_formulas_of_the_paper(
-    numpy_l1, seed, n, excess, dt, alpha, filter_input, bound, scalar_rate
+    numpy_l1, seed, n, excess, dt, alpha, filter_input, bound, scalar_rate, projected
 ):
     m = max(1, n - excess)
     rng = np.random.default_rng(seed)
@@ -46,9 +47,10 @@ def test_agrees_with_the_formulas_of_the_paper(
         filter_input=filter_input,
         action_low=None if bound is None else -bound,
         action_high=bound,
+        project=projected,
     )
     limits = {} if bound is None else {"low": -bound, "high": bound}
-    oracle = numpy_l1(dt, alpha / dt, rates, filter_input=filter_input, **limits)
+    oracle = numpy_l1(dt, alpha / dt, rates, filter_input=filter_input, project=projected, **limits)
     state = init([], n, m, dtype=torch.float64)
     for t in range(8):
         x, drift, u_rl = rng.normal(size=n), rng.normal(size=n), rng.normal(size=m)
@@ -224,6 +226,41 @@ def test_the_estimate_is_bounded_by_the_disturbance():
         x = x + (jac @ (u + d).unsqueeze(-1)).squeeze(-1)
         largest = max(largest, state.sigma_m.abs().item(), state.q.abs().item())
     assert 0.5 < largest <= bound * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("filter_input", ["current", "previous"])
+def test_projection_bounds_the_filter_where_actions_have_almost_no_effect(filter_input):
+    def largest(**settings) -> tuple[float, L1State, torch.Tensor]:
+        config = L1Config(0.05, filter_input=filter_input, **settings)
+        jac = torch.full((1, 1, 1), 1e-12, dtype=torch.float64)
+        state = init([1], 1, 1, dtype=torch.float64)
+        zero, x = torch.zeros(1, 1, dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
+        most = 0.0
+        for _ in range(50):
+            _, state, diagnostics = step(config, state, x, zero, zero, jac)
+            x = x + 0.1  # a disturbance that the model does not know
+            most = max(most, state.q.abs().item(), state.sigma_m.abs().item())
+        assert diagnostics.non_finite.item() is False
+        return most, state, diagnostics.matched + diagnostics.unmatched
+
+    bounds = {"action_low": -1.0, "action_high": 2.0}
+    projected, state, rates = largest(**bounds)
+    assert 2.9 < projected <= 3.0
+    free, free_state, free_rates = largest(**bounds, project=False)
+    assert free > 1e6
+    # Predictor and diagnostics take in the whole estimate either way.
+    torch.testing.assert_close(state.x_hat, free_state.x_hat)
+    torch.testing.assert_close(rates, free_rates)
+    for open_bounds in ({}, {"action_low": -1.0}, {"action_low": -1.0, "action_high": np.inf}):
+        assert largest(**open_bounds)[0] > 1e6
+    assert largest(action_low=(-1.0,), action_high=(2.0,))[0] == projected
+
+
+def test_projection_uses_each_entrys_own_range():
+    config = L1Config(0.05, action_low=(-1.0, -0.5), action_high=(0.5, np.inf))
+    assert config.matched_bound == (1.5, np.inf)
+    sigma_m = torch.tensor([[9.0, 9.0], [-9.0, 1.0]])
+    assert project(config, sigma_m).tolist() == [[1.5, 9.0], [-1.5, 1.0]]
 
 
 def test_bounds_apply_to_the_policy_and_to_the_executed_input():

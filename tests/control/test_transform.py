@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import pickle
 
 import pytest
@@ -20,7 +21,7 @@ from torchrl.envs import (
 from torchrl.envs.transforms import Transform
 
 from torchrl_l1.control import ActionJacobian, L1Config, L1Diagnostics, L1Transform
-from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.dynamics import EnsembleDynamics, EnsembleModelEnv
 
 
 def make_model(n: int = 3, m: int = 1) -> EnsembleDynamics:
@@ -237,10 +238,40 @@ def test_survives_pickling_and_cloning():
     transform = L1Transform(make_model(), dt=0.05)
     actor = make_actor()
     expected = make_env(transform).rollout(5, actor)["next", "l1", "x_hat"]
-    for copy in (pickle.loads(pickle.dumps(transform.clone())), transform.clone()):
-        data = make_env(copy).rollout(5, actor)
+    for twin in (pickle.loads(pickle.dumps(transform.clone())), transform.clone()):
+        data = make_env(twin).rollout(5, actor)
         torch.testing.assert_close(data["next", "l1", "x_hat"], expected, atol=0, rtol=0)
     assert transform.clone().model is transform.model
+
+
+def test_a_copied_environment_goes_on_without_a_reset():
+    # Built of parts that can be pickled.
+    base = EnsembleModelEnv(make_model(), cost, start, -2.0, 2.0)
+    env = TransformedEnv(base, Compose(L1Transform(make_model(), dt=0.05)))
+    actor = make_actor()
+    data = env.step(actor(env.reset()))["next"].exclude("reward")
+    for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        following = twin.step(actor(data.clone()))
+        expected = env.step(actor(data.clone()))
+        assert following["next", "l1", "started"].all()
+        for name, value in expected["next", "l1"].items():
+            torch.testing.assert_close(following["next", "l1", name], value, atol=0, rtol=0)
+
+
+def cost(observation: torch.Tensor, action: torch.Tensor, successor: torch.Tensor) -> torch.Tensor:
+    return successor.square().sum(-1)
+
+
+def start(count: int) -> torch.Tensor:
+    return torch.full((count, 3), 0.5)
+
+
+def test_a_transform_inserted_between_steps_counts_at_once():
+    env = TransformedEnv(GymEnv("Pendulum-v1"), L1Transform(make_model(), dt=0.05))
+    data = env.reset().set("action", torch.full((1,), 5.0))
+    assert env.step(data.clone())["next", "l1", "u_exec"].item() == 2.0
+    env.insert_transform(0, ActionScaling())
+    assert env.step(data.clone())["next", "l1", "u_exec"].item() == 1.0
 
 
 def test_native_autoreset_restarts_the_environments_that_ended():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -26,7 +27,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_l1.control import ActionJacobian, L1Config, L1State, L1Transform, augment, init
 from torchrl_l1.dynamics import EnsembleDynamics
-from torchrl_l1.envs import BatchedMujocoEnv
+from torchrl_l1.envs import TASKS, BatchedMujocoEnv
 
 CONFIG = L1Config(0.04, epsilon=0.003, action_low=-3.0, action_high=3.0)
 pendulum = partial(GymEnv, "InvertedPendulum-v5")
@@ -136,6 +137,33 @@ def test_in_a_collector(model, actor, max_frames):
     # The second batch goes on where the first ended.
     assert_l1_is_right(torch.cat(batches, dim=-1), model)
     assert batches[1]["l1", "started"][:, 0].all() or max_frames is not None
+
+
+@pytest.mark.parametrize("in_collector", [False, True])
+def test_own_environments_that_end_at_different_times(model, in_collector):
+    falling = replace(TASKS["inverted_pendulum"], terminated=lambda o: o[..., 1].abs() > 0.2)
+    env = with_l1(BatchedMujocoEnv(falling, num_envs=4, seed=0), model, max_steps=None)
+    push = torch.tensor([[0.2], [0.5], [1.0], [-1.5]])
+    actor = TensorDictModule(lambda x: push + 0.1 * x[..., :1], ["observation"], ["action"])
+    if in_collector:
+        with set_auto_unwrap_transformed_env(True):
+            collector = Collector(
+                env,
+                actor,
+                frames_per_batch=80,
+                total_frames=160,
+                auto_register_policy_transforms=False,
+            )
+        data = torch.cat(list(collector), dim=-1)
+        collector.shutdown()
+    else:
+        data = env.rollout(40, actor, break_when_any_done=False)
+        env.close()
+    ends = data["next", "terminated"].squeeze(-1)
+    assert ends.any(-1).all()
+    assert (ends.any(0) & ~ends.all(0)).any()  # partial resets
+    assert len({tuple(row.nonzero().flatten().tolist()) for row in ends}) == 4
+    assert_l1_is_right(data, model)
 
 
 def test_partial_reset_by_hand(model, actor):

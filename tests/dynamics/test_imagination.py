@@ -87,6 +87,17 @@ def test_random_member_propagation_uses_single_members() -> None:
         EnsembleModelEnv(model, reward, lambda c: torch.zeros(c, 2), -1.0, 1.0, (), "both")
 
 
+@pytest.mark.parametrize("propagation", ["mean", "random_member"])
+def test_model_as_environment_without_batch_dimensions(propagation: str) -> None:
+    env = EnsembleModelEnv(
+        drifting_model(2.5), reward, lambda n: torch.zeros(n, 2), -1.0, 1.0, (), propagation
+    )
+    check_env_specs(env)
+    rollout = env.rollout(10, lambda td: td.set("action", torch.ones(1)))
+    assert rollout["next", "observation"][:2, 0].tolist() == [1.0, 2.0]
+    assert rollout.shape == (3,)
+
+
 def test_torchrl_planner_accepts_the_model() -> None:
     torch.manual_seed(0)
     env = EnsembleModelEnv(

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -44,7 +43,7 @@ def test_presets_are_those_of_the_controller(name: str) -> None:
     recipe = typed("metrpo/half_cheetah", f"l1={name}")
     bounds = {"action_low": -1.0, "action_high": 1.0}
     preset = getattr(L1Config, name)(0.05, epsilon=3.0, **bounds)
-    assert l1_config(recipe.l1, recipe.task) == replace(preset, alpha=0.35)
+    assert l1_config(recipe.l1, recipe.task) == preset
     assert preset.filter_gain == 0.35
 
 
@@ -77,8 +76,11 @@ def test_typos_are_refused() -> None:
         find_recipe("nowhere.yaml")
 
 
-def test_alpha_and_cutoff_together_are_refused() -> None:
-    recipe = typed("metrpo/inverted_pendulum", "l1.cutoff=5.0")
+def test_cutoff_or_alpha_but_not_both() -> None:
+    controller = l1_config(typed("metrpo/inverted_pendulum", "l1.cutoff=5.0").l1, "half_cheetah")
+    assert controller is not None
+    assert controller.filter_gain == pytest.approx(5.0 * 0.05)
+    recipe = typed("metrpo/inverted_pendulum", "l1.cutoff=5.0", "l1.alpha=0.1")
     with pytest.raises(ValueError, match="cutoff"):
         l1_config(recipe.l1, recipe.task)
 
@@ -86,9 +88,10 @@ def test_alpha_and_cutoff_together_are_refused() -> None:
 def test_a_users_own_recipe_builds_on_the_shipped_groups(tmp_path: Path) -> None:
     own = tmp_path / "mine.yaml"
     own.write_text(
-        "defaults: [metrpo_recipe, {l1: slow}, {noise: action}, _self_, {preset: cpu}]\n"
-        "recipe: mine\ntask: half_cheetah\n"
+        "defaults: [metrpo_recipe, {l1: slow}, {noise: action}, {preset: cpu}, _self_]\n"
+        "recipe: mine\ntask: half_cheetah\nmodel: {hidden: [64]}\n"
     )
     recipe = typed(str(own))
     assert recipe.l1.alpha == 0.1
-    assert recipe.model.hidden == [256, 256]
+    assert recipe.model.hidden == [64]
+    assert recipe.fit.batch_size == 500

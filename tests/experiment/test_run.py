@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import IO
 
 import pytest
 import torch
@@ -17,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_l1.algorithms.metrpo_metrics import METRICS
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
+from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError, save_atomically
 
 Recipe = Callable[..., DictConfig]
 
@@ -110,9 +111,13 @@ def test_bad_settings_are_refused_before_anything_is_written(
         ("l1.epsilon=-1", "epsilon"),
         ("model.activation=gelu", "activation"),
         ("policy.std=0", "standard deviation"),
-        ("device=tpu", "device"),
+        ("device=tpu", "device must be"),
+        ("l1.compile=maybe", r"l1\.compile"),
+        ("trpo.fisher_fraction=0", r"trpo\.fisher_fraction"),
+        ("trpo.max_kl=-1", r"trpo\.max_kl"),
+        ("discount=2", "discount"),
     ]:
-        with pytest.raises((ValueError, KeyError, RuntimeError), match=message):
+        with pytest.raises((ValueError, KeyError), match=message):
             run(tiny_recipe(override))
         assert not (tmp_path / "run").exists(), override
 
@@ -129,42 +134,76 @@ def test_wandb_offline_keeps_everything(
         assert key in content
 
 
+def test_finished_run_may_grow(tiny_recipe: Recipe, tmp_path: Path) -> None:
+    directory = run(tiny_recipe())
+    run(tiny_recipe("outer_iterations=3", "resume=true"))
+    grown = (directory / "metrics.csv").read_text()
+    assert len(grown.splitlines()) == 4
+    whole = run(tiny_recipe("outer_iterations=3", f"run_dir={tmp_path / 'whole'}"))
+    assert (whole / "metrics.csv").read_text() == grown
+    with pytest.raises(RunDirectoryError, match="outer_iterations: 3 there, 2 now"):
+        run(tiny_recipe("resume=true"))
+
+
+def test_interrupted_write_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "checkpoint.pt"
+    save_atomically(file, {"iteration": 1})
+
+    def fail_midway(state: object, handle: IO[bytes]) -> None:
+        handle.write(b"half a check")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(torch, "save", fail_midway)
+    with pytest.raises(KeyboardInterrupt):
+        save_atomically(file, {"iteration": 2})
+    assert torch.load(file, weights_only=True) == {"iteration": 1}
+
+
 def test_killed_run_resumes_to_the_same_metrics(tmp_path: Path, tiny_overrides: list[str]) -> None:
     command = [
         *(sys.executable, "-m", "torchrl_l1.cli", "run", "metrpo/inverted_pendulum"),
         *tiny_overrides,
-        "outer_iterations=5",
-        "fit.max_epochs=40",
-        "fit.patience=40",
+        "outer_iterations=6",
+        "fit.max_epochs=150",
+        "fit.patience=150",
     ]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
 
-    def finish(folder: Path) -> str:
-        subprocess.run(
+    def start(folder: Path) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
             [*command, f"run_dir={folder}", "--resume"],
-            env=environment,
-            check=True,
-            capture_output=True,
-            timeout=300,
-        )
-        return (folder / "metrics.csv").read_text()
-
-    unbroken = finish(tmp_path / "unbroken")
-    rng, killed = random.Random(0), tmp_path / "killed"
-    for rows_before_kill in (1, 3):
-        process = subprocess.Popen(
-            [*command, f"run_dir={killed}", "--resume"],
             env=environment,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        while process.poll() is None and rows(killed) < rows_before_kill:
-            time.sleep(0.005)
-        time.sleep(rng.uniform(0, 0.3))
+
+    unbroken, killed = tmp_path / "unbroken", tmp_path / "killed"
+    assert start(unbroken).wait(timeout=300) == 0
+    iteration = mean_seconds(unbroken)
+    rng = random.Random(0)
+    # Before the first checkpoint, then twice at a random moment of a later iteration.
+    for rows_before_kill in (0, 1, 3):
+        process = start(killed)
+        while process.poll() is None and not reached(killed, rows_before_kill):
+            time.sleep(0.002)
+        time.sleep(rng.uniform(0, iteration))
         process.send_signal(signal.SIGKILL)
         assert process.wait() == -signal.SIGKILL
-    assert rows(killed) < 5
-    assert finish(killed) == unbroken
+    assert rows(killed) < 6
+    assert start(killed).wait(timeout=300) == 0
+    assert (killed / "metrics.csv").read_text() == (unbroken / "metrics.csv").read_text()
+
+
+def mean_seconds(folder: Path) -> float:
+    with (folder / "timing.csv").open() as file:
+        table = list(csv.DictReader(file))
+    return sum(float(v) for row in table for k, v in row.items() if k != "iteration") / len(table)
+
+
+def reached(folder: Path, count: int) -> bool:
+    return (folder / "config.yaml").exists() and rows(folder) >= count
 
 
 def rows(folder: Path) -> int:

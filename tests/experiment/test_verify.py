@@ -51,7 +51,7 @@ def write(path: Path, **traces: dict) -> Path:
     return path
 
 
-@pytest.mark.skipif(not REFERENCE.exists(), reason=f"no reference traces at ../{REFERENCE.name}")
+@pytest.mark.skipif(not REFERENCE.exists(), reason="no ../shared/reference/l1_reference_traces.npz")
 def test_reference_traces_replay_exactly():
     errors = verify_traces(REFERENCE)
     assert len(errors) == 10

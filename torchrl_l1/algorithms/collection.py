@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property, partial
 
 import torch
 from tensordict import TensorDictBase
@@ -13,8 +14,9 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, RewardSum, TransformedEnv
 from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_type
 
-from torchrl_l1.algorithms.seeding import stream_seed
+from torchrl_l1.algorithms.seeding import seed_streams, stream_seed
 from torchrl_l1.control import L1Config, L1Transform
+from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.envs import Task, make_env
 
@@ -50,13 +52,14 @@ def make_pipeline(
     dynamics: EnsembleDynamics,
     l1: L1Config | None,
     horizon: int | None = None,
+    compile_l1: CompileMode = False,
 ) -> TransformedEnv:
     """The perturbed environment, augmented by L1 unless ``l1`` is ``None``.
 
     The order matters: on its way in, an action meets L1 first and the noise last; on its way
     out, an observation is noisy before L1 sees it.
     """
-    extra = [] if l1 is None else [L1Transform(dynamics, l1)]
+    extra = [] if l1 is None else [L1Transform(dynamics, l1, compile=compile_l1)]
     return make_env(
         task,
         num_envs,
@@ -84,16 +87,20 @@ class Collection:
         l1: L1Config | None,
         perturbation: Perturbation,
         horizon: int | None = None,
+        compile_l1: CompileMode = False,
     ) -> None:
         self.horizon = horizon or task.horizon
         self.frames = episodes * self.horizon
         self.policy = policy
-        self.env = make_pipeline(task, episodes, perturbation, dynamics, l1, horizon)
-        self._policy_batches = self._batches(self.env, policy)
+        self.env = make_pipeline(task, episodes, perturbation, dynamics, l1, horizon, compile_l1)
         # Random data never pass through L1: there is no model yet.
-        bare = make_pipeline(task, episodes, perturbation, dynamics, None, horizon)
-        self._random_env = bare
-        self._random_batches = self._batches(bare, RandomPolicy(bare.full_action_spec))
+        self._bare_env = partial(
+            make_pipeline, task, episodes, perturbation, dynamics, None, horizon
+        )
+
+    @cached_property
+    def _policy_batches(self) -> Iterator[TensorDictBase]:
+        return self._batches(self.env, self.policy)
 
     def _batches(
         self, env: TransformedEnv, policy: TensorDictModuleBase
@@ -111,13 +118,16 @@ class Collection:
 
     def random(self, seed: int) -> TensorDictBase:
         """Episodes ``[N, T]`` of uniformly random actions."""
-        self._random_env.set_seed(stream_seed(seed, "random") % 2**31)
-        return _with_executed(next(self._random_batches))
+        env = self._bare_env()
+        batches = self._batches(env, RandomPolicy(env.full_action_spec))
+        _seed(env, seed, "random")
+        return _with_executed(next(batches))
 
     def collect(self, seed: int, iteration: int) -> TensorDictBase:
         """Episodes ``[N, T]`` of the stochastic policy, through L1 if it is on."""
-        self.env.set_seed(stream_seed(seed, "collect", iteration) % 2**31)
-        return _with_executed(next(self._policy_batches))
+        batches = self._policy_batches
+        _seed(self.env, seed, "collect", iteration)
+        return _with_executed(next(batches))
 
     def evaluate(
         self,
@@ -131,32 +141,38 @@ class Collection:
 
         ``callback`` is called after every step with the environment and the data so far.
         """
-        self.env.set_seed(stream_seed(seed, "evaluate", iteration) % 2**31)
+        _seed(self.env, seed, "evaluate", iteration)
         kind = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
         with torch.no_grad(), set_exploration_type(kind):
             return self.env.rollout(
                 steps or self.horizon, self.policy, callback=callback, break_when_any_done=False
             )
 
-    def metrics(self, data: TensorDictBase) -> dict[str, float]:
-        """Returns of the finished episodes in ``data`` and means and maxima of L1's signals."""
-        returns = episode_returns(data)
-        metrics = {
-            "return_mean": returns.mean().item(),
-            "return_std": returns.std(correction=0).item(),
-            "return_min": returns.min().item(),
-            "return_max": returns.max().item(),
-            "episodes": returns.numel(),
-            "non_finite_steps": int(data["next", "non_finite"].sum()),
-        }
-        signals = data.get(("next", "l1"), None)
-        if signals is not None:
-            for name, label in _L1_MEANS.items():
-                metrics[f"l1/{label}"] = signals[name].float().mean().item()
-            for name in _L1_MEANS_AND_MAXIMA:
-                metrics[f"l1/{name}"] = signals[name].mean().item()
-                metrics[f"l1/{name}_max"] = signals[name].max().item()
-        return metrics
+
+def return_metrics(data: TensorDictBase) -> dict[str, float]:
+    """Statistics of the returns of the episodes that ended within ``data``."""
+    returns = episode_returns(data)
+    return {
+        "return_mean": returns.mean().item(),
+        "return_std": returns.std(correction=0).item(),
+        "return_min": returns.min().item(),
+        "return_max": returns.max().item(),
+        "episodes": returns.numel(),
+    }
+
+
+def signal_metrics(data: TensorDictBase) -> dict[str, float]:
+    """Non-finite steps, and means and maxima of L1's signals if it is on."""
+    metrics: dict[str, float] = {"non_finite_steps": int(data["next", "non_finite"].sum())}
+    signals = data.get(("next", "l1"), None)
+    if signals is not None:
+        metrics["l1/non_finite"] = int(signals["non_finite"].sum())
+        for name, label in _L1_MEANS.items():
+            metrics[f"l1/{label}"] = signals[name].float().mean().item()
+        for name in _L1_MEANS_AND_MAXIMA:
+            metrics[f"l1/{name}"] = signals[name].mean().item()
+            metrics[f"l1/{name}_max"] = signals[name].max().item()
+    return metrics
 
 
 def episode_returns(data: TensorDictBase) -> Tensor:
@@ -167,3 +183,9 @@ def episode_returns(data: TensorDictBase) -> Tensor:
 def _with_executed(data: TensorDictBase) -> TensorDictBase:
     executed = data.get(("next", "l1", "u_exec"), None)
     return data.set("executed", data["action"] if executed is None else executed)
+
+
+def _seed(env: EnvBase, seed: int, *names: str | int) -> None:
+    """Start the resets and torch's global generator on a stream that nothing before touched."""
+    env.set_seed(stream_seed(seed, *names) % 2**31)
+    seed_streams(seed, *names)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from time import perf_counter
 from typing import Any
@@ -18,14 +19,21 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from torchrl_l1.algorithms.collection import Collection, Perturbation, episode_returns
+from torchrl_l1.algorithms.advantages import imagined_advantages
+from torchrl_l1.algorithms.collection import (
+    Collection,
+    Perturbation,
+    episode_returns,
+    return_metrics,
+    signal_metrics,
+)
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig
 from torchrl_l1.algorithms.metrpo_metrics import PolicyStep, fit_metrics, policy_metrics
 from torchrl_l1.algorithms.policy import GaussianPolicy, clipped, make_actor
 from torchrl_l1.algorithms.seeding import seed_streams
 from torchrl_l1.control import L1Config
+from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.dynamics import EnsembleDynamics, fit_ensemble, imagine
 from torchrl_l1.envs import StartStates, get_task
 from torchrl_l1.objectives import LinearFeatureBaseline, trpo_step
@@ -53,6 +61,8 @@ class METRPO:
         device: where models are fitted and trajectories imagined: ``cpu``, ``cuda`` or ``auto``.
             Real environments, and the copies of policy and model that act in them, are on the
             CPU.
+        compile_l1: whether to compile the controller's step, see
+            :class:`~torchrl_l1.control.L1Transform`.
         on_phase: called with a word on what is going on, for progress bars.
     """
 
@@ -65,6 +75,7 @@ class METRPO:
         seed: int = 0,
         horizon: int | None = None,
         device: str = "cpu",
+        compile_l1: CompileMode = False,
         on_phase: Callable[[str], None] | None = None,
     ) -> None:
         self.config, self.seed = config, seed
@@ -95,15 +106,22 @@ class METRPO:
         self.acting_policy = self.policy if on_cpu else deepcopy(self.policy).cpu()
         self.acting_dynamics = self.dynamics if on_cpu else deepcopy(self.dynamics).cpu()
         self.start_states = StartStates(self.task)
-        self.collection = Collection(
+        real = partial(
+            Collection,
             self.task,
-            config.episodes_per_iteration,
-            clipped(make_actor(self.acting_policy), self.action_low.cpu(), self.action_high.cpu()),
-            self.acting_dynamics,
-            l1,
-            perturbation or Perturbation(),
-            horizon,
+            policy=clipped(
+                make_actor(self.acting_policy), self.action_low.cpu(), self.action_high.cpu()
+            ),
+            dynamics=self.acting_dynamics,
+            l1=l1,
+            perturbation=perturbation or Perturbation(),
+            compile_l1=compile_l1,
         )
+        full = horizon or self.task.horizon
+        self.collection = real(
+            episodes=config.episodes_per_iteration, horizon=min(config.episode_steps or full, full)
+        )
+        self.evaluation = real(episodes=config.evaluation_episodes, horizon=full)
         frames = self.collection.frames
         self.buffer = ReplayBuffer(
             storage=LazyTensorStorage((config.outer_iterations + 1) * frames),
@@ -148,14 +166,15 @@ class METRPO:
             data = self.collection.collect(self.seed, self.iteration)
             self.store(data)
             clock.append(perf_counter())
-            deterministic = episode_returns(self.collection.evaluate(self.seed, self.iteration))
+            self.on_phase("evaluating")
+            returns = self.evaluate(data)
             clock.append(perf_counter())
 
             metrics = {
                 "iteration": self.iteration,
                 "real_steps": (self.iteration + 2) * self.collection.frames,
-                **self.collection.metrics(data),
-                "return_deterministic": deterministic.mean().item(),
+                **returns,
+                **signal_metrics(data),
                 **fit_metrics(fit),
                 **policy_metrics(steps),
                 "policy/std": self.policy.log_std.detach().exp().mean().item(),
@@ -175,6 +194,20 @@ class METRPO:
         items["validation"] = torch.rand(items.shape[0]) < self.config.fit.validation_fraction
         self.buffer.extend(items)
 
+    def evaluate(self, data: TensorDictBase) -> dict[str, float]:
+        """Returns of full episodes: with sampled actions and with the policy's mean action.
+
+        Where the collected episodes are full, they are the ones with sampled actions.
+        """
+        evaluate = partial(self.evaluation.evaluate, self.seed, self.iteration)
+        shorter = self.collection.horizon < self.evaluation.horizon
+        sampled = evaluate(deterministic=False) if shorter else data
+        mean_action = episode_returns(evaluate(deterministic=True))
+        return {
+            **return_metrics(sampled),
+            "return_deterministic": mean_action.mean().item(),
+        }
+
     def improve_policy(self) -> PolicyStep:
         """One TRPO step on fresh imagined trajectories; the baseline is refitted after it."""
         config = self.config
@@ -190,23 +223,9 @@ class METRPO:
         observation, step = trajectories["observation"], trajectories["step"]
         with torch.no_grad():
             value = self.baseline(observation, step)
-            done = trajectories["next", "done"]
-            # No bootstrap at the imagined horizon: the baseline knows the time. What follows an
-            # exit from the box is unknown; to call it zero would reward leaving wherever
-            # rewards are negative, so the value of the last state inside stands for it.
-            terminated = torch.zeros_like(done)
-            terminated[:, -1] = True
-            if config.box_exit == "fail":
-                terminated |= trajectories["next", "terminated"]
-            advantage, target = generalized_advantage_estimate(
-                config.discount,
-                config.gae_lambda,
-                value,
-                torch.cat([value[:, 1:], torch.zeros_like(value[:, :1])], dim=1),
-                trajectories["next", "reward"],
-                done=done,
-                terminated=terminated,
-            )
+        advantage, target = imagined_advantages(
+            trajectories, value, config.discount, config.gae_lambda, config.box_exit
+        )
         valid = trajectories["valid"].squeeze(-1)
         samples = TensorDict(
             {
@@ -261,6 +280,8 @@ def resolve_device(name: str) -> torch.device:
     """``auto`` is CUDA where there is one; a device that is not there is a ``ValueError``."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name not in ("cpu", "cuda"):
+        raise ValueError(f"device must be cpu, cuda or auto, got {name!r}")
     device = torch.device(name)
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError("device=cuda was asked for, but torch finds no CUDA device; use cpu")

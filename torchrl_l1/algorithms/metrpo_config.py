@@ -45,6 +45,11 @@ class METRPOConfig:
         outer_iterations: rounds of fit, policy improvement and collection.
         episodes_per_iteration: real episodes per round (and of random data before the first),
             run side by side.
+        episode_steps: steps of a collected episode; the task's horizon if null. Where early
+            policies fail early, shorter episodes see more of what matters. Returns are then
+            measured on full episodes that do not join the data.
+        evaluation_episodes: full episodes with the mean action after each round (and with
+            sampled actions if ``episode_steps`` is shorter than the horizon).
         trpo_iterations: TRPO steps per round.
         imagined_steps: imagined transitions per TRPO step.
         imagined_horizon: length of an imagined trajectory.
@@ -66,6 +71,8 @@ class METRPOConfig:
 
     outer_iterations: int = 33
     episodes_per_iteration: int = 6
+    episode_steps: int | None = None
+    evaluation_episodes: int = 6
     trpo_iterations: int = 20
     imagined_steps: int = 50_000
     imagined_horizon: int = 200
@@ -91,8 +98,10 @@ class METRPOConfig:
                 raise ValueError(
                     f"{name} must be {' or '.join(map(repr, allowed))}, got {getattr(self, name)!r}"
                 )
-        counts = ("outer_iterations", "episodes_per_iteration", "trpo_iterations")
-        for name in (*counts, "imagined_horizon"):
+        if self.episode_steps is not None and self.episode_steps < 1:
+            raise ValueError(f"episode_steps must be at least 1 or null, got {self.episode_steps}")
+        counts = ("outer_iterations", "episodes_per_iteration", "evaluation_episodes")
+        for name in (*counts, "trpo_iterations", "imagined_horizon"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.imagined_steps < self.imagined_horizon:
@@ -100,5 +109,6 @@ class METRPOConfig:
                 f"imagined_steps ({self.imagined_steps}) must hold at least one trajectory of "
                 f"imagined_horizon ({self.imagined_horizon}) steps"
             )
-        if not 0 <= self.imagined_from_data <= 1:
-            raise ValueError(f"imagined_from_data must be in [0, 1], got {self.imagined_from_data}")
+        for name in ("imagined_from_data", "discount", "gae_lambda"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")

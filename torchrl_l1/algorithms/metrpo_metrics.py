@@ -11,14 +11,16 @@ from torchrl_l1.objectives import TRPOReport
 METRICS: dict[str, str] = {
     "iteration": "Outer iteration, from 0.",
     "real_steps": "Real environment steps so far, the initial random ones included.",
-    "return_mean": "Mean return of this iteration's real episodes: the stochastic policy, with L1 "
-    "if it is on. These episodes join the data. The paper's figure of merit.",
+    "return_mean": "Mean return of real episodes of the stochastic policy, with L1 if it is on: the "
+    "paper's figure of merit. They are the episodes that join the data, unless `episode_steps` "
+    "makes those shorter than the task; then they are full ones beside the data.",
     "return_std": "Standard deviation over these episodes.",
     "return_min": "Lowest return among them.",
     "return_max": "Highest return among them.",
-    "return_deterministic": "Mean return of as many extra episodes with the policy's mean action "
-    "(and L1 if it is on). These do not join the data and are not counted as real steps.",
-    "episodes": "Number of real episodes finished in this iteration.",
+    "return_deterministic": "Mean return of `evaluation_episodes` full episodes with the policy's "
+    "mean action (and L1 if it is on). They do not join the data and are not counted as real "
+    "steps.",
+    "episodes": "Number of episodes behind `return_mean`.",
     "non_finite_steps": "Real steps on which the simulator's state became non-finite; they end "
     "the episode and are kept out of the data.",
     "model/train_loss": "Mean training loss of a member in the last epoch, normalised units.",
@@ -46,8 +48,9 @@ METRICS: dict[str, str] = {
     "l1/unmatched_max": "Largest such norm.",
     "l1/u_a": "Mean norm of the adaptive input, action units.",
     "l1/u_a_max": "Largest such norm.",
-    "l1/saturation": "Share of steps on which the executed input met a bound.",
+    "l1/saturation": "Share of action entries that a bound cut.",
     "l1/ill_conditioned": "Share of steps with a rank-deficient or ill-conditioned Jacobian.",
+    "l1/non_finite": "Steps on which an input of L1 was not finite and it stood aside.",
 }
 """Every metric of :class:`~torchrl_l1.algorithms.METRPO`; ``l1/...`` only with L1 on."""
 

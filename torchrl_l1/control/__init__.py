@@ -6,9 +6,9 @@ put it into an environment or behind a policy.
 
 from torchrl_l1.control.affine import (
     AffineModel,
-    Linearization,
-    linearize,
-    relinearize,
+    Affinization,
+    affinize,
+    reaffinize,
     switching_law,
 )
 from torchrl_l1.control.affinizer import Affinizer
@@ -22,6 +22,7 @@ from torchrl_l1.control.transform import L1Transform
 __all__ = [
     "ActionJacobian",
     "AffineModel",
+    "Affinization",
     "Affinizer",
     "DynamicsModel",
     "L1Config",
@@ -29,11 +30,10 @@ __all__ = [
     "L1Diagnostics",
     "L1State",
     "L1Transform",
-    "Linearization",
+    "affinize",
     "augment",
     "init",
-    "linearize",
-    "relinearize",
+    "reaffinize",
     "solve_matched",
     "step",
     "switching_law",

@@ -22,7 +22,7 @@ class AffineModel(NamedTuple):
     jacobian: Tensor
 
 
-class Linearization(NamedTuple):
+class Affinization(NamedTuple):
     """A model's value and derivative at the operating input.
 
     Attributes:
@@ -47,13 +47,13 @@ class Linearization(NamedTuple):
         return AffineModel(self.change(torch.zeros_like(self.u_bar)), self.jacobian)
 
 
-def linearize(model: ActionJacobian, observation: Tensor, u_bar: Tensor) -> Linearization:
+def affinize(model: ActionJacobian, observation: Tensor, u_bar: Tensor) -> Affinization:
     """Evaluate the model and its Jacobian at ``u_bar``."""
-    return Linearization(u_bar, *model.value_and_jacobian(observation, u_bar))
+    return Affinization(u_bar, *model.value_and_jacobian(observation, u_bar))
 
 
 def switching_law(
-    linearization: Linearization, action: Tensor, value: Tensor, epsilon: float
+    affinization: Affinization, action: Tensor, value: Tensor, epsilon: float
 ) -> tuple[Tensor, Tensor]:
     r"""Whether the affine model has become too inaccurate at ``action``.
 
@@ -62,7 +62,7 @@ def switching_law(
     units. An error that is not a number does not switch.
 
     Args:
-        linearization: the affine model.
+        affinization: the affine model.
         action: the tested input ``(..., m)``.
         value: the model's own prediction at ``action`` ``(..., n)``.
         epsilon: tolerance, state units.
@@ -70,17 +70,17 @@ def switching_law(
     Returns:
         switch ``(..., 1)`` (bool) and the error ``(..., 1)``.
     """
-    error = torch.linalg.vector_norm(linearization.change(action) - value, dim=-1, keepdim=True)
+    error = torch.linalg.vector_norm(affinization.change(action) - value, dim=-1, keepdim=True)
     return error > epsilon, error
 
 
-def relinearize(
+def reaffinize(
     model: ActionJacobian,
     observation: Tensor,
-    linearization: Linearization,
+    affinization: Affinization,
     u_rl: Tensor,
     switch: Tensor,
-) -> Linearization:
+) -> Affinization:
     """Move the operating point to ``u_rl`` where ``switch`` is set.
 
     The Jacobian is the dearest part of a step. On the CPU it is evaluated only for the
@@ -88,20 +88,20 @@ def relinearize(
     would stall the queue it is evaluated for all and selected.
     """
     if torch.compiler.is_compiling() or observation.device.type != "cpu":
-        moved = linearize(model, observation, u_rl)
-        return Linearization(
-            u_bar=torch.where(switch, moved.u_bar, linearization.u_bar),
-            value=torch.where(switch, moved.value, linearization.value),
-            jacobian=torch.where(switch.unsqueeze(-1), moved.jacobian, linearization.jacobian),
+        moved = affinize(model, observation, u_rl)
+        return Affinization(
+            u_bar=torch.where(switch, moved.u_bar, affinization.u_bar),
+            value=torch.where(switch, moved.value, affinization.value),
+            jacobian=torch.where(switch.unsqueeze(-1), moved.jacobian, affinization.jacobian),
         )
     rows = switch.squeeze(-1)
     if not rows.any():
-        return linearization
+        return affinization
     if rows.all():
-        return linearize(model, observation, u_rl)
+        return affinize(model, observation, u_rl)
     value, jacobian = model.value_and_jacobian(observation[rows], u_rl[rows])
-    return Linearization(
-        u_bar=torch.where(switch, u_rl, linearization.u_bar),
-        value=linearization.value.index_put((rows,), value),
-        jacobian=linearization.jacobian.index_put((rows,), jacobian),
+    return Affinization(
+        u_bar=torch.where(switch, u_rl, affinization.u_bar),
+        value=affinization.value.index_put((rows,), value),
+        jacobian=affinization.jacobian.index_put((rows,), jacobian),
     )

@@ -10,13 +10,14 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
-from torchrl_l1.control.affine import linearize, relinearize, switching_law
+from torchrl_l1.control.affine import affinize, reaffinize, switching_law
 from torchrl_l1.control.faces import (
     Dynamics,
     as_action_jacobian,
     declared_dimension,
     required_entry,
 )
+from torchrl_l1.control.jacobian import Predicts
 
 _STATE = ("u_bar", "started")
 
@@ -42,6 +43,8 @@ class Affinizer(TensorDictModuleBase):
         key: name of the nested tensordict with the entries written.
         action_dim: width of the action; needed by :meth:`make_primer` if the model has no
             attribute of that name.
+        predicts: what ``dynamics`` predicts, ``"change"`` or ``"next_observation"``; ``None``
+            decides as :class:`~torchrl_l1.control.ActionJacobian` does.
 
     Raises:
         KeyError: at a call, if the observation, the action or the remembered input is missing.
@@ -65,11 +68,12 @@ class Affinizer(TensorDictModuleBase):
         action_key: NestedKey = "action",
         key: str = "affine",
         action_dim: int | None = None,
+        predicts: Predicts | None = None,
     ) -> None:
         super().__init__()
         if epsilon is not None and not epsilon >= 0:
             raise ValueError(f"epsilon must not be negative, got {epsilon}")
-        self.model = as_action_jacobian(dynamics, observation_key, action_key)
+        self.model = as_action_jacobian(dynamics, observation_key, action_key, predicts)
         self.epsilon = epsilon
         self.observation_key = observation_key
         self.action_key = action_key
@@ -104,24 +108,24 @@ class Affinizer(TensorDictModuleBase):
         dtype = self.model.dtype or observation.dtype
         observation, action = observation.to(dtype), action.to(dtype)
         if self.epsilon is None:
-            linearization = linearize(self.model, observation, action)
+            affinization = affinize(self.model, observation, action)
         else:
             u_bar, started = (self._memory(tensordict, name) for name in _STATE)
-            current = linearize(self.model, observation, torch.where(started, u_bar, action))
+            current = affinize(self.model, observation, torch.where(started, u_bar, action))
             value = self.model.value(observation, action)
             switch, error = switching_law(current, action, value, self.epsilon)
             switch = switch & started
-            linearization = relinearize(self.model, observation, current, action, switch)
+            affinization = reaffinize(self.model, observation, current, action, switch)
             tensordict.set((self.key, "switch"), switch)
             tensordict.set((self.key, "error"), torch.where(started, error, 0.0))
             following = TensorDict(
-                u_bar=linearization.u_bar,
+                u_bar=affinization.u_bar,
                 started=torch.ones_like(started),
                 batch_size=tensordict.batch_size,
                 device=tensordict.device,
             )
             tensordict.set(("next", self.key), following)
-        drift, jacobian = linearization.affine()
+        drift, jacobian = affinization.affine()
         tensordict.set((self.key, "drift"), drift)
         return tensordict.set((self.key, "jacobian"), jacobian)
 

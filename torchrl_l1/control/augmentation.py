@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrl_l1.control import law
-from torchrl_l1.control.affine import Linearization, linearize, relinearize, switching_law
+from torchrl_l1.control.affine import Affinization, affinize, reaffinize, switching_law
 from torchrl_l1.control.jacobian import ActionJacobian
 from torchrl_l1.control.law import L1Config, L1Diagnostics, L1State
 
@@ -24,7 +24,7 @@ class Assessment(NamedTuple):
     """
 
     u_rl: Tensor
-    current: Linearization
+    current: Affinization
     switch: Tensor
     error: Tensor
 
@@ -64,7 +64,7 @@ def augment(
         tensor([0.9000, 0.9000, 0.9000])
     """
     assessment = assess(config, model, state, observation, u_rl)
-    selected = relinearize(
+    selected = reaffinize(
         model, observation, assessment.current, assessment.u_rl, assessment.switch
     )
     return conclude(config, state, observation, assessment, selected)
@@ -80,19 +80,17 @@ def assess(
     """First part of :func:`augment`: affinize at the remembered point and test the result."""
     u_rl = law.saturate(config, u_rl)
     u_bar = torch.where(state.started, state.u_bar, u_rl)
+    current = affinize(model, observation, u_bar)
     if config.switch_on == "executed" and config.filter_input == "current":
         # The executed input depends on the Jacobian, through this step's estimate.
-        current = linearize(model, observation, u_bar)
         tested = law.step(config, state, observation, u_rl, *current.affine())[0]
-        value = model.value(observation, tested)
     else:
         tested = u_rl
         if config.switch_on == "executed":
             # It does not depend on the operating point: the filter's next state is known.
             adapted = law.saturate(config, u_rl - law.filtered(config, state.q, state.sigma_m))
             tested = torch.where(state.started, adapted, u_rl)
-        at_u_bar, jacobian, value = model.values_and_jacobian(observation, u_bar, tested)
-        current = Linearization(u_bar, at_u_bar, jacobian)
+    value = model.value(observation, tested)
     switch, error = switching_law(current, tested, value, config.epsilon)
     # Rounding may separate two evaluations at the same input; a first step never switches.
     return Assessment(u_rl, current, switch & state.started, error)
@@ -103,7 +101,7 @@ def conclude(
     state: L1State,
     observation: Tensor,
     assessment: Assessment,
-    selected: Linearization,
+    selected: Affinization,
 ) -> tuple[Tensor, L1State, L1Diagnostics]:
     """Last part of :func:`augment`: the adaptive law around the selected operating point."""
     restart = assessment.switch if config.on_switch == "reset" else None

@@ -47,6 +47,11 @@ class L1Config:
         action_low: lower bound of the executed action, a number or one per action dimension;
             ``None`` for no bound.
         action_high: upper bound of the executed action.
+        project: whether the matched estimate that enters the filter is projected, entry by
+            entry, onto ``[action_low - action_high, action_high - action_low]`` where both are
+            finite. No action cancels a larger matched disturbance, and where the actions have
+            almost no effect the estimate has no bound of its own. The predictor takes in the
+            whole estimate either way.
 
     Raises:
         ValueError: for a setting out of its domain, or settings that exclude each other.
@@ -71,6 +76,7 @@ class L1Config:
     filter_input: FilterInput = "previous"
     action_low: Scalars | None = None
     action_high: Scalars | None = None
+    project: bool = True
 
     def __post_init__(self) -> None:
         for name in ("dt", "epsilon", "cutoff", "alpha"):
@@ -86,6 +92,8 @@ class L1Config:
                 raise ValueError(f"{name} must be one of {choices}, got {getattr(self, name)!r}")
         for name in ("a_s", "action_low", "action_high"):
             object.__setattr__(self, name, _as_scalars(name, getattr(self, name)))
+        if not isinstance(self.project, bool):
+            raise ValueError(f"project must be True or False, got {self.project!r}")
         self._check_filter()
         self._check_predictor()
         self._check_bounds()
@@ -138,11 +146,12 @@ class L1Config:
 
     @classmethod
     def reference(cls, dt: float, *, epsilon: float = 1.0, **settings: Any) -> L1Config:
-        """The authors' released controller: restarted at every switch."""
+        """The authors' released controller: restarted at every switch, no projection."""
         reference: dict[str, Any] = {
             "on_switch": "reset",
             "switch_on": "policy",
             "filter_input": "current",
+            "project": False,
         }
         return cls(dt, epsilon=epsilon, **(reference | settings))
 
@@ -152,6 +161,21 @@ class L1Config:
         if self.cutoff is not None:
             return self.cutoff * self.dt
         return DEFAULT_ALPHA if self.alpha is None else self.alpha
+
+    @property
+    def matched_bound(self) -> Scalars | None:
+        """Largest magnitude of the matched estimate that enters the filter, action units.
+
+        ``action_high - action_low``, infinite where one of them is; ``None`` without bounds or
+        projection.
+        """
+        if not self.project or self.action_low is None or self.action_high is None:
+            return None
+        low, high = self.action_low, self.action_high
+        if isinstance(low, tuple) and isinstance(high, tuple):
+            return tuple(b - a for a, b in zip(low, high, strict=True))
+        # The configuration expands a number beside a tuple, so both are numbers here.
+        return _tuple(high)[0] - _tuple(low)[0]
 
     @property
     def adaptation_gain(self) -> Scalars:

@@ -19,6 +19,7 @@ from torchrl_l1.control.faces import (
     declared_dimension,
     make_step,
 )
+from torchrl_l1.control.jacobian import Predicts
 from torchrl_l1.control.law import L1Config, L1State
 from torchrl_l1.control.specs import L1_KEY, Layout
 
@@ -52,6 +53,8 @@ class L1Controller(TensorDictModuleBase):
         action_dim: width of the action, likewise.
         compile: ``True`` compiles the step, ``"auto"`` does so where a compiler works.
         diagnostics: whether to write the diagnostics.
+        predicts: what ``dynamics`` predicts, ``"change"`` or ``"next_observation"``; ``None``
+            decides as :class:`~torchrl_l1.control.ActionJacobian` does.
 
     Raises:
         KeyError: at a call, if the observation, the action or the controller's state is missing.
@@ -85,10 +88,11 @@ class L1Controller(TensorDictModuleBase):
         action_dim: int | None = None,
         compile: CompileMode = False,
         diagnostics: bool = True,
+        predicts: Predicts | None = None,
     ) -> None:
         super().__init__()
         self.config = config
-        self.model = as_action_jacobian(dynamics, observation_key, action_key)
+        self.model = as_action_jacobian(dynamics, observation_key, action_key, predicts)
         self.observation_key = observation_key
         self.action_key = action_key
         self.key = key

@@ -13,10 +13,10 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_l1.control import specs
-from torchrl_l1.control.affine import Linearization, relinearize
+from torchrl_l1.control.affine import Affinization, reaffinize
 from torchrl_l1.control.augmentation import Assessment, assess, augment, conclude
 from torchrl_l1.control.compilation import CompileMode, compiled
-from torchrl_l1.control.jacobian import ActionJacobian, ChangeFunction, DynamicsModel
+from torchrl_l1.control.jacobian import ActionJacobian, ChangeFunction, DynamicsModel, Predicts
 from torchrl_l1.control.law import L1Config, L1Diagnostics, L1State
 
 Dynamics: TypeAlias = ActionJacobian | DynamicsModel | TensorDictModuleBase | ChangeFunction
@@ -25,12 +25,22 @@ StepFunction = Callable[[L1State, Tensor, Tensor], Step]
 
 
 def as_action_jacobian(
-    dynamics: Dynamics, observation_key: NestedKey, action_key: NestedKey
+    dynamics: Dynamics,
+    observation_key: NestedKey,
+    action_key: NestedKey,
+    predicts: Predicts | None = None,
 ) -> ActionJacobian:
     """The dynamics as an :class:`ActionJacobian`, which is returned as it is."""
     if isinstance(dynamics, ActionJacobian):
+        if predicts not in (None, dynamics.predicts):
+            raise ValueError(
+                f"predicts={predicts!r} was given, but the ActionJacobian has "
+                f"predicts={dynamics.predicts!r}: give it there"
+            )
         return dynamics
-    return ActionJacobian(dynamics, observation_key=observation_key, action_key=action_key)
+    return ActionJacobian(
+        dynamics, observation_key=observation_key, action_key=action_key, predicts=predicts
+    )
 
 
 def make_step(config: L1Config, model: ActionJacobian, mode: CompileMode) -> StepFunction:
@@ -46,7 +56,7 @@ def make_step(config: L1Config, model: ActionJacobian, mode: CompileMode) -> Ste
         return assess(config, model, state, observation, u_rl)
 
     def last(
-        state: L1State, observation: Tensor, assessment: Assessment, selected: Linearization
+        state: L1State, observation: Tensor, assessment: Assessment, selected: Affinization
     ) -> Step:
         return conclude(config, state, observation, assessment, selected)
 
@@ -60,7 +70,7 @@ def make_step(config: L1Config, model: ActionJacobian, mode: CompileMode) -> Ste
         if observation.device.type != "cpu":
             return whole_graph(state, observation, u_rl)
         assessment = first_graph(state, observation, u_rl)
-        selected = relinearize(
+        selected = reaffinize(
             model, observation, assessment.current, assessment.u_rl, assessment.switch
         )
         return last_graph(state, observation, assessment, selected)

@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
 Predicts = Literal["change", "next_observation"]
@@ -22,9 +22,7 @@ class DynamicsModel(Protocol):
 
     A model may also have ``value_and_jacobian(observation, action)``, which returns the same
     change ``(..., n)`` together with its derivative with respect to the action ``(..., n, m)``
-    in raw units; it is then used in place of automatic differentiation. With
-    ``values_and_jacobian(observation, action, other)`` it gives in one pass also the change at a
-    second action, ``(..., n)``, which the switching law needs.
+    in raw units; it is then used in place of automatic differentiation.
     """
 
     def mean_change(self, observation: Tensor, action: Tensor) -> Tensor:
@@ -48,7 +46,9 @@ class ActionJacobian:
         observation_key: key under which a TensorDictModule reads the observation.
         action_key: key under which it reads the action.
         out_key: key of its prediction; needed if it has several output keys.
-        predicts: whether it predicts the ``"change"`` of state or the ``"next_observation"``.
+        predicts: whether it predicts the ``"change"`` of state or the ``"next_observation"``. If
+            ``None``, a TensorDictModule that writes ``("next", observation_key)`` or
+            ``observation_key`` itself predicts the latter, any other model the former.
         ensemble_dim: dimension of its output over which the mean is taken, for a module that
             returns one prediction per ensemble member.
 
@@ -70,20 +70,17 @@ class ActionJacobian:
         observation_key: NestedKey = "observation",
         action_key: NestedKey = "action",
         out_key: NestedKey | None = None,
-        predicts: Predicts = "change",
+        predicts: Predicts | None = None,
         ensemble_dim: int | None = None,
     ) -> None:
-        if predicts not in ("change", "next_observation"):
+        if predicts not in (None, "change", "next_observation"):
             raise ValueError(f"predicts must be 'change' or 'next_observation', got {predicts!r}")
         self.dynamics = dynamics
-        self.predicts = predicts
         self.ensemble_dim = ensemble_dim
         self.analytic = callable(getattr(dynamics, "value_and_jacobian", None))
-        one_pass = getattr(dynamics, "values_and_jacobian", None)
-        self._values_and_jacobian = one_pass if self.analytic else None
         self._predict: ChangeFunction
         if isinstance(dynamics, DynamicsModel):
-            if predicts != "change" or ensemble_dim is not None or out_key is not None:
+            if predicts == "next_observation" or ensemble_dim is not None or out_key is not None:
                 raise ValueError(
                     f"{type(dynamics).__name__} has a mean_change method, which gives the mean "
                     "change of state: predicts, ensemble_dim and out_key do not apply to it"
@@ -95,7 +92,10 @@ class ActionJacobian:
                 "action)"
             )
         elif isinstance(dynamics, TensorDictModuleBase):
+            out_key = _prediction_key(dynamics, observation_key, action_key, out_key)
             self._predict = _on_tensors(dynamics, observation_key, action_key, out_key)
+            if predicts is None and _is_observation(out_key, observation_key):
+                predicts = "next_observation"
         elif callable(dynamics):
             if out_key is not None:
                 raise ValueError("out_key applies to TensorDictModules only")
@@ -105,6 +105,7 @@ class ActionJacobian:
                 "dynamics must have a mean_change(observation, action) method, be a "
                 f"TensorDictModule or a callable, got {type(dynamics).__name__}"
             )
+        self.predicts: Predicts = predicts or "change"
         if not self.analytic:
             _load_forward_mode()
 
@@ -156,14 +157,6 @@ class ActionJacobian:
 
     __call__ = value_and_jacobian
 
-    def values_and_jacobian(
-        self, observation: Tensor, action: Tensor, other: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Value and Jacobian at ``action`` and the value at ``other``, of the same shape."""
-        if self._values_and_jacobian is not None:
-            return self._values_and_jacobian(observation, action, other)
-        return *self.value_and_jacobian(observation, action), self.value(observation, other)
-
     def _forward_mode(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         def push_forward(tangent: Tensor) -> tuple[Tensor, ...]:
             return torch.func.jvp(
@@ -186,12 +179,12 @@ def _load_forward_mode() -> None:
         torch.func.jvp(torch.sin, (torch.zeros(()),), (torch.ones(()),))
 
 
-def _on_tensors(
+def _prediction_key(
     module: TensorDictModuleBase,
     observation_key: NestedKey,
     action_key: NestedKey,
     out_key: NestedKey | None,
-) -> ChangeFunction:
+) -> NestedKey:
     unknown = [key for key in module.in_keys if key not in (observation_key, action_key)]
     if unknown or len(module.in_keys) != 2:
         raise ValueError(
@@ -203,10 +196,23 @@ def _on_tensors(
             raise ValueError(
                 f"the dynamics module writes {module.out_keys}: name its prediction with out_key"
             )
-        out_key = module.out_keys[0]
-    elif out_key not in module.out_keys:
+        return module.out_keys[0]
+    if out_key not in module.out_keys:
         raise ValueError(f"the dynamics module writes {module.out_keys}, not out_key={out_key!r}")
+    return out_key
 
+
+def _is_observation(key: NestedKey, observation_key: NestedKey) -> bool:
+    following = unravel_key(("next", observation_key))
+    return unravel_key(key) in (unravel_key(observation_key), following)
+
+
+def _on_tensors(
+    module: TensorDictModuleBase,
+    observation_key: NestedKey,
+    action_key: NestedKey,
+    out_key: NestedKey,
+) -> ChangeFunction:
     def predict(observation: Tensor, action: Tensor) -> Tensor:
         data = TensorDict({}, batch_size=observation.shape[:-1])
         data.set(observation_key, observation)

@@ -20,6 +20,7 @@ __all__ = [
     "SwitchOn",
     "filtered",
     "init",
+    "project",
     "saturate",
     "step",
 ]
@@ -32,7 +33,8 @@ class L1State(NamedTuple):
         x_hat: predicted observation ``(..., n)``.
         u_bar: operating point of the affine model ``(..., m)``.
         q: filter state ``(..., m)``; the adaptive input is ``-q``.
-        sigma_m: matched uncertainty estimated at the last step ``(..., m)``, action units.
+        sigma_m: matched uncertainty estimated at the last step ``(..., m)``, action units,
+            projected if the configuration asks for it.
         n_switch: switches since the reset ``(..., 1)``, int64.
         started: whether the other entries mean anything ``(..., 1)``, bool.
     """
@@ -112,6 +114,22 @@ def saturate(config: L1Config, action: Tensor) -> Tensor:
     return torch.clamp(action, low, high)
 
 
+def project(config: L1Config, sigma_m: Tensor) -> Tensor:
+    r"""The matched estimate within :attr:`L1Config.matched_bound`.
+
+    This is the projection of adaptive control for a box. The authors' formulas have none, but
+    least squares with an almost vanishing :math:`J` turns any prediction error into an estimate
+    without bound, and the low-pass filter would take long to forget it.
+    """
+    bound = config.matched_bound
+    if bound is None:
+        return sigma_m
+    if isinstance(bound, tuple):
+        limit = torch.tensor(bound, dtype=sigma_m.dtype, device=sigma_m.device)
+        return torch.clamp(sigma_m, -limit, limit)
+    return torch.clamp(sigma_m, -bound, bound)
+
+
 def filtered(config: L1Config, q: Tensor, sigma_m: Tensor) -> Tensor:
     r"""Next state of the low-pass filter, :math:`q + \alpha (\sigma_m - q)`.
 
@@ -132,8 +150,8 @@ def step(
     r"""One step of the L1 adaptive controller on the affine model ``x' = x + drift + jacobian u``.
 
     arXiv 2403.14860, Algorithm 1 and the discrete-time law of section 3.2. With
-    :math:`\tilde x = \hat x - x` the prediction error, :math:`T` the sampling time and
-    :math:`A_s` diagonal,
+    :math:`\tilde x = \hat x - x` the prediction error, :math:`d_t` the drift, :math:`J` the
+    Jacobian, :math:`T` the sampling time and :math:`A_s` diagonal,
 
     .. math::
 
@@ -142,11 +160,12 @@ def step(
         J \sigma_m &\approx T \hat\sigma \quad\text{(least squares)} \\
         q &\leftarrow q + \alpha (\sigma_m - q) \\
         u &= \mathrm{clip}(u_{RL} - q) \\
-        \hat x &\leftarrow \hat x + f + J u + T (\hat\sigma + A_s \tilde x)
+        \hat x &\leftarrow \hat x + d_t + J u + T (\hat\sigma + A_s \tilde x)
 
     The estimate :math:`\hat\sigma` is in state units per second and the matched part
     :math:`\sigma_m` in action units. What the least squares leaves over is unmatched: it enters
-    the prediction and no action cancels it. The predictor sees the saturated input.
+    the prediction and no action cancels it. The predictor sees the saturated input. Before the
+    filter takes :math:`\sigma_m` in, it is projected, see :func:`project`.
 
     Pure, batched over leading dimensions and free of data-dependent branches. Where any input
     of an environment is not finite the output is ``u_rl``, ``non_finite`` is set and that
@@ -188,7 +207,8 @@ def step(
     # step here: this is T sigma_hat, so that no division by a small T enters the state.
     x_err = x_hat - observation
     estimate = x_err * -_like(x_err, config.adaptation_gain)
-    sigma_m, ill_conditioned = solve_matched(jacobian, estimate)
+    matched, ill_conditioned = solve_matched(jacobian, estimate)
+    sigma_m = project(config, matched)
 
     # Control input.
     if config.filter_input == "previous":
@@ -199,12 +219,12 @@ def step(
     u = saturate(config, unbounded)
 
     # State predictor.
-    effect_u, effect_sigma_m = (jacobian @ torch.stack([u, sigma_m], dim=-1)).unbind(-1)
+    effect_u, effect_matched = (jacobian @ torch.stack([u, matched], dim=-1)).unbind(-1)
     x_hat = x_hat + drift + effect_u - x_err * _like(x_err, config.predictor_gain)
 
     finite = x_hat.sum(-1, keepdim=True).isfinite()
     norms = torch.linalg.vector_norm(
-        torch.stack([x_err, effect_sigma_m, estimate - effect_sigma_m], dim=-2), dim=-1
+        torch.stack([x_err, effect_matched, estimate - effect_matched], dim=-2), dim=-1
     )
     norms = torch.where(finite, norms, 0.0)
     rates = norms[..., 1:] / config.dt

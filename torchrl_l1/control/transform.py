@@ -16,6 +16,7 @@ from torchrl.envs.transforms import Compose, Transform
 
 from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.control.faces import Dynamics, StepFunction, advance, as_action_jacobian, make_step
+from torchrl_l1.control.jacobian import Predicts
 from torchrl_l1.control.law import L1Config
 from torchrl_l1.control.specs import L1_KEY, Layout
 
@@ -59,6 +60,8 @@ class L1Transform(Transform):
         diagnostics: whether to write the diagnostics.
         dtype: type in which the controller computes; that of the model's parameters if
             ``None``, or the observation's for a model without any.
+        predicts: what ``dynamics`` predicts, ``"change"`` or ``"next_observation"``; ``None``
+            decides as :class:`~torchrl_l1.control.ActionJacobian` does.
         **settings: further fields of :class:`L1Config` (``epsilon``, ``cutoff``, ...).
 
     Raises:
@@ -89,11 +92,12 @@ class L1Transform(Transform):
         compile: CompileMode = False,
         diagnostics: bool = True,
         dtype: torch.dtype | None = None,
+        predicts: Predicts | None = None,
         **settings: Any,
     ) -> None:
         super().__init__()
         self.config = _configuration(config, dt, settings)
-        self.model = as_action_jacobian(dynamics, observation_key, action_key)
+        self.model = as_action_jacobian(dynamics, observation_key, action_key, predicts)
         self.observation_key = unravel_key(observation_key)
         self.action_key = unravel_key(action_key)
         self.key = key
@@ -134,8 +138,12 @@ class L1Transform(Transform):
         )
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self._step_function is None or self.container is None:
-            return self.forward(tensordict)
+        if self._layout is None or self._step_function is None:
+            # After copying, or when a transform before this one came or went without a reset.
+            if not self._is_in_environment():
+                return self.forward(tensordict)
+            self._resolve()
+        assert self._step_function is not None
         _, executed, following = advance(
             self._step_function,
             tensordict,
@@ -193,6 +201,12 @@ class L1Transform(Transform):
                 self._step_config = config
             self._layout = layout
         return self._layout
+
+    def _is_in_environment(self) -> bool:
+        try:
+            return self.container is not None
+        except ValueError:  # TorchRL's answer where the container is a replay buffer
+            return False
 
     def _check_order(self) -> None:
         chain = list(_flatten(self.container.transform))

@@ -19,7 +19,9 @@ class FitConfig:
     """How an ensemble is fitted.
 
     Attributes:
-        learning_rate: Adam's step size.
+        learning_rate: Adam's step size at the start of a fit.
+        final_learning_rate_fraction: the step size at the end as a fraction of that at the
+            start, reached linearly over the gradient steps that a fit may take.
         batch_size: transitions per member and gradient step.
         max_epochs: passes over the training data.
         max_gradient_steps: bound on gradient steps, whatever the number of epochs.
@@ -30,9 +32,10 @@ class FitConfig:
     """
 
     learning_rate: float = 1e-3
+    final_learning_rate_fraction: float = 0.1
     batch_size: int = 500
     max_epochs: int = 50
-    max_gradient_steps: int = 600
+    max_gradient_steps: int = 800
     patience: int = 5
     validation_fraction: float = 0.1
     weight_penalty: float = 0.0
@@ -52,11 +55,23 @@ class FitConfig:
             )
         if self.learning_rate <= 0:
             raise ValueError(f"fit.learning_rate must be positive, got {self.learning_rate}")
+        if not 0 < self.final_learning_rate_fraction <= 1:
+            raise ValueError(
+                "fit.final_learning_rate_fraction must be positive and at most 1, got "
+                f"{self.final_learning_rate_fraction}"
+            )
 
 
 @dataclass
 class FitReport:
-    """Outcome of a fit: losses of the weights that were kept, averaged over the members."""
+    """Outcome of a fit, averaged over the members.
+
+    Attributes:
+        train_loss: running mean of the loss over the last epoch, while its weights changed.
+        validation_loss: loss of the weights that were kept.
+        epochs: passes over the training data.
+        gradient_steps: gradient steps taken.
+    """
 
     train_loss: float
     validation_loss: float
@@ -113,6 +128,7 @@ def fit_ensemble(
     batches = size // batch_size
     best_loss = torch.full((members,), torch.inf, device=device)
     best_weights = [parameter.detach().clone() for parameter in dynamics.parameters()]
+    planned = min(config.max_epochs * batches, config.max_gradient_steps)
     stale = epoch = steps = 0
     while epoch < config.max_epochs and steps < config.max_gradient_steps:
         order = torch.stack([torch.randperm(size) for _ in range(members)]).to(device)
@@ -123,6 +139,9 @@ def fit_ensemble(
             running += objective.detach()
             if config.weight_penalty:
                 objective = objective + config.weight_penalty * _penalty(dynamics) / size
+            decay = 1 - (1 - config.final_learning_rate_fraction) * steps / planned
+            for group in optimizer.param_groups:
+                group["lr"] = config.learning_rate * decay
             optimizer.zero_grad(set_to_none=True)
             objective.backward()
             optimizer.step()

@@ -31,5 +31,5 @@ class DeterministicHead(nn.Module):
         return dim
 
     def loss(self, raw: Tensor, target: Tensor) -> Tensor:
-        """Squared error averaged over the target's columns (arXiv 2403.14860, eq. 1)."""
+        """Squared error averaged over the target's columns (arXiv 2403.14860, section 3.1)."""
         return (raw - target).square().mean(-1)

@@ -15,7 +15,7 @@ class EnsembleDynamicsLoss(LossModule):
     """Loss of every member of an :class:`EnsembleDynamics` on its own batch of transitions.
 
     The target is the normalised change of state; what is minimised per sample is the head's
-    business (mean squared error for the deterministic head, arXiv 2403.14860, eq. 1). The
+    business (mean squared error for the deterministic head, arXiv 2403.14860, section 3.1). The
     members' losses are summed, so that each member's gradient is what it would be alone.
 
     Args:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_l1.dynamics.ensemble import ActivationName, EnsembleMLP
-from torchrl_l1.dynamics.heads import DeterministicHead
+from torchrl_l1.dynamics.heads import DeterministicHead, Head
 from torchrl_l1.dynamics.normalizer import DataBox, Normalizer
 
 
@@ -28,6 +28,8 @@ class EnsembleDynamics(nn.Module):
         activation: ``"relu"``, ``"tanh"`` or ``"silu"``.
         std_floor: smallest standard deviation of the normalisers, in raw units.
         box_margin: widening of the box around the data, see :class:`DataBox`.
+        head: meaning of a member's raw output and its loss; a :class:`DeterministicHead` if
+            ``None``.
 
     Examples:
         >>> import torch
@@ -46,11 +48,12 @@ class EnsembleDynamics(nn.Module):
         activation: ActivationName = "relu",
         std_floor: float = 1e-4,
         box_margin: float = 0.5,
+        head: Head | None = None,
     ) -> None:
         super().__init__()
         self.observation_dim = observation_dim
         self.action_dim = action_dim
-        self.head = DeterministicHead()
+        self.head: Head = DeterministicHead() if head is None else head
         self.network = EnsembleMLP(
             observation_dim + action_dim,
             self.head.out_features(observation_dim),
@@ -113,7 +116,8 @@ class EnsembleDynamics(nn.Module):
         r"""Mean predicted change and its derivative with respect to the action, in raw units.
 
         The chain rule through the normalisers is :math:`J = D_{\Delta x} J' D_{u}^{-1}` with
-        the floored standard deviations (arXiv 2403.14860, eq. 22).
+        the floored standard deviations (arXiv 2403.14860, appendix, technical remarks
+        on METRPO).
 
         Returns:
             change ``(..., n)`` and Jacobian ``(..., n, m)``.

@@ -45,8 +45,11 @@ class EnsembleWorldModel(TensorDictModuleBase):
             change = self.dynamics.mean_change(observation, action)
         else:
             member = int(torch.randint(self.dynamics.members, ()))
-            flat = (observation.reshape(-1, observation.shape[-1]), action.flatten(0, -2))
-            change = self.dynamics.member_change(*flat, member).reshape(observation.shape)
+            change = self.dynamics.member_change(
+                observation.reshape(-1, observation.shape[-1]),
+                action.reshape(-1, action.shape[-1]),
+                member,
+            ).reshape(observation.shape)
         successor = observation + change
         left = ~self.dynamics.box.contains(successor).unsqueeze(-1)
         return tensordict.update(

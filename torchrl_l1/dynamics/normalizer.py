@@ -13,7 +13,7 @@ class Normalizer(nn.Module):
     deviation never falls below ``std_floor``: a state that hardly moves would otherwise turn
     rounding errors into large normalised values, and its reciprocal into a large Jacobian.
     Whoever differentiates through the normaliser must use :attr:`std` as it stands here
-    (arXiv 2403.14860, eq. 22), floor included.
+    (arXiv 2403.14860, appendix, technical remarks on METRPO), floor included.
 
     Args:
         dim: width of the vectors.

@@ -44,14 +44,15 @@ class _UniformNoise(Transform):
 
 
 class ActionNoise(_UniformNoise):
-    r"""Adds :math:`\xi \sim U(-w, w)`, independent per entry and step, to the executed action.
+    r"""Adds :math:`\xi \sim U(-w, w)`, independent per entry and step, to the action.
 
     The action in the rollout stays noise-free: only what travels on to the base environment
     changes. The sum is not clipped again (MuJoCo clamps limited actuators), and the reward's
     control cost sees the noisy action, as in the authors' released code.
 
     Place it *before* a controller such as ``L1Transform`` in ``Compose``: actions travel from the
-    last transform to the first, so the noise then hits the controller's output.
+    last transform to the first, so the noise then acts on what the controller sends to the
+    actuators.
 
     Args:
         half_width: half-width ``w`` in raw action units; the standard deviation is

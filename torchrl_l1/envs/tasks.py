@@ -1,8 +1,9 @@
 """The benchmark tasks: one table of facts that physics, rewards and imagination share.
 
-A :class:`Task` says everything that distinguishes one benchmark from another. The real environment
-(:class:`~torchrl_l1.envs.BatchedMujocoEnv`) and the imagined rollouts of a model-based algorithm
-evaluate the *same* reward function, so they cannot drift apart. The facts follow the authors'
+A :class:`Task` says everything that distinguishes one benchmark from another. On both tasks here the
+real environment (:class:`~torchrl_l1.envs.BatchedMujocoEnv`) and the imagined rollouts of a
+model-based algorithm evaluate the *same* reward function, so they cannot drift apart. A task may
+differ in that: imagination asks for :attr:`Task.imagined_reward`. The facts follow the authors'
 released code for arXiv 2403.14860, which builds on MBBL (arXiv:1907.02057); they differ from the
 ``-v4`` and ``-v5`` environments of Gymnasium, whose XML files (and nothing else) are used.
 """

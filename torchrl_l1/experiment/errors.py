@@ -17,3 +17,8 @@ USER_ERRORS = (
     RunDirectoryError,
     ValueError,
 )
+
+
+def message(error: BaseException) -> str:
+    """The error's own words; ``KeyError`` would quote them like a key."""
+    return str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)

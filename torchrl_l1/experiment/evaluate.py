@@ -9,16 +9,20 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import OmegaConf
 from tqdm import tqdm
 
-from torchrl_l1.algorithms.collection import Collection, Perturbation
+from torchrl_l1.algorithms.collection import (
+    Collection,
+    Perturbation,
+    return_metrics,
+    signal_metrics,
+)
 from torchrl_l1.algorithms.metrpo import METRPO
 from torchrl_l1.experiment.recipes import shared_dir
 from torchrl_l1.experiment.run import build
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
-from torchrl_l1.experiment.schema import L1Settings, METRPORecipe, l1_config
+from torchrl_l1.experiment.schema import L1Settings, METRPORecipe, WandbSettings, l1_config
 
 
 @dataclass(frozen=True)
@@ -85,7 +89,7 @@ def conditions(
 ) -> list[Condition]:
     """Every combination of controller, noise and policy with each bias and, apart, each gain."""
     disturbances = [(b, 1.0) for b in bias] + [(0.0, g) for g in gain if g != 1.0]
-    cells = product(policy, noise, dict.fromkeys(disturbances), l1)
+    cells = product(*map(dict.fromkeys, (policy, noise, disturbances, l1)))
     return [Condition(on, n, b, g, p) for p, n, (b, g), on in cells]
 
 
@@ -102,14 +106,14 @@ def evaluate(
     those of the run's last checkpoint.
     """
     for cell in cells:
-        torch.manual_seed(seed)
         collection = make_collection(trained, cell, episodes, epsilon)
         data = collection.evaluate(seed, deterministic=cell.policy == "deterministic")
         yield {
             "run": str(trained.path),
             "training_seed": trained.recipe.seed,
             **vars(cell),
-            **collection.metrics(data),
+            **return_metrics(data),
+            **signal_metrics(data),
         }
 
 
@@ -133,6 +137,20 @@ def make_collection(
     )
 
 
+def _check_one_study(runs: Sequence[TrainedRun]) -> None:
+    """Runs may differ in their seed and in nothing that matters."""
+
+    def settings(trained: TrainedRun) -> METRPORecipe:
+        return replace(trained.recipe, seed=0, run_dir="", resume=False, wandb=WandbSettings())
+
+    for trained in runs[1:]:
+        if settings(trained) != settings(runs[0]):
+            raise ValueError(
+                f"{runs[0].path} and {trained.path} differ in more than their seed; evaluate them "
+                "one at a time"
+            )
+
+
 def evaluate_command(options: argparse.Namespace) -> None:
     """``torchrl-l1 evaluate``: table on the screen, CSV, PNG and, if asked, a filmstrip."""
     # Plotting takes a second to import; errors in the request should not wait for it.
@@ -143,10 +161,8 @@ def evaluate_command(options: argparse.Namespace) -> None:
         group_setting("noise", name)
     if options.episodes < 1:
         raise ValueError(f"--episodes must be positive, got {options.episodes}")
-    runs = [load_run(path) for path in options.run_dir]
-    tasks = {trained.recipe.task for trained in runs}
-    if len(tasks) > 1:
-        raise ValueError(f"the runs are of different tasks: {', '.join(sorted(tasks))}")
+    runs = [load_run(path) for path in dict.fromkeys(map(Path, options.run_dir))]
+    _check_one_study(runs)
     output = Path(options.output) if options.output else runs[0].path / "evaluation"
     rows = []
     total = len(runs) * len(cells)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from torchrl.envs import EnvBase
 
 from torchrl_l1.experiment.evaluate import Condition, TrainedRun, make_collection
@@ -34,7 +33,7 @@ def write_filmstrip(
     Where no headless OpenGL works, a line says so and nothing is written.
     """
     task = trained.algorithm.task
-    steps = min(task.horizon, round(_SECONDS_SHOWN / task.dt))
+    steps = min(trained.recipe.horizon or task.horizon, round(_SECONDS_SHOWN / task.dt))
     try:
         rows = {
             f"L1 {name}": rollout_frames(
@@ -59,7 +58,6 @@ def _poses(
     def record(env: EnvBase, _: object) -> None:
         poses.append(env.base_env.simulator_state()[0][0])
 
-    torch.manual_seed(seed)
     collection = make_collection(trained, cell, 1, epsilon)
     collection.evaluate(seed, deterministic=True, steps=steps, callback=record)
     return np.stack(poses)

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import hydra
+from hydra.errors import CompactHydraException
 from omegaconf import DictConfig
 
+from torchrl_l1.experiment.errors import USER_ERRORS, message
 from torchrl_l1.experiment.recipes import find_recipe, recipes_dir, shared_dir
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.schema import register
@@ -17,30 +19,54 @@ from torchrl_l1.experiment.schema import register
 _HYDRA_SETTINGS = [
     "hydra.output_subdir=null",
     "hydra.run.dir=.",
-    "hydra.sweep.dir=.",
+    "hydra.sweep.dir=runs/sweeps/${now:%Y-%m-%d_%H-%M-%S}",
     "hydra.sweep.subdir=.",
     "hydra/job_logging=disabled",
     "hydra/hydra_logging=disabled",
-    "hydra.job.config.override_dirname.exclude_keys=[seed,run_dir,resume,threads,wandb.mode]",
+    "hydra.job.config.override_dirname.exclude_keys=[seed,run_dir,resume,wandb.mode]",
 ]
 
+_FLAGS_WITH_VALUE = (
+    *("--cfg", "-c", "--package", "-p", "--info", "-i", "--config-dir", "-cd"),
+    *("--config-name", "-cn", "--config-path", "-cp", "--experimental-rerun"),
+)
 
-def launch(name: str, overrides: Sequence[str]) -> None:
-    """Run a recipe as a Hydra application with the given overrides and Hydra flags.
+
+def launch(name: str, arguments: Sequence[str]) -> None:
+    """Run a recipe as a Hydra application with overrides and Hydra's own flags, in any order.
 
     Raises:
         RecipeError: if there is no such recipe.
     """
     recipe = find_recipe(name)
     register()
-    arguments = sys.argv
-    sys.argv = ["torchrl-l1", *_search_path(recipe), *_HYDRA_SETTINGS, *overrides]
+    flags, overrides = split_flags(arguments)
+    before = sys.argv
+    sys.argv = ["torchrl-l1", *flags, *_search_path(recipe), *_HYDRA_SETTINGS, *overrides]
     try:
         hydra.main(version_base="1.3", config_path=str(recipe.parent), config_name=recipe.stem)(
             _task
         )()
     finally:
-        sys.argv = arguments
+        sys.argv = before
+
+
+def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Hydra's flags, with their values, and the overrides: argparse wants them apart.
+
+    Examples:
+        >>> split_flags(["seed=0,1", "-m", "l1=off", "--cfg", "job"])
+        (['-m', '--cfg', 'job'], ['seed=0,1', 'l1=off'])
+    """
+    flags: list[str] = []
+    overrides: list[str] = []
+    takes_value = False
+    for argument in arguments:
+        is_flag = argument.startswith("-")
+        is_value = takes_value and not is_flag and "=" not in argument
+        (flags if is_flag or is_value else overrides).append(argument)
+        takes_value = argument in _FLAGS_WITH_VALUE
+    return flags, overrides
 
 
 def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:
@@ -66,4 +92,8 @@ def _search_path(recipe: Path) -> list[str]:
 
 
 def _task(config: DictConfig) -> None:
-    run(config)
+    try:
+        run(config)
+    except USER_ERRORS as error:
+        # Hydra prints such an exception as one line and exits with status 1.
+        raise CompactHydraException(f"torchrl-l1 run: {message(error)}") from error

@@ -45,7 +45,7 @@ def find_recipe(name: str) -> Path:
         RecipeError: if there is none.
     """
     own = Path(name)
-    if own.suffix in (".yaml", ".yml"):
+    if own.suffix == ".yaml":
         if not own.is_file():
             raise RecipeError(f"recipe file {name} does not exist")
         return own.resolve()
@@ -55,6 +55,6 @@ def find_recipe(name: str) -> Path:
         hint = f" Did you mean {close[0]}?" if close else ""
         raise RecipeError(
             f"unknown recipe {name!r}.{hint} Available: {', '.join(available)}; "
-            "or give the path of a YAML file."
+            "or give the path of a .yaml file."
         )
     return recipes_dir() / f"{name}.yaml"

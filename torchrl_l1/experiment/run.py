@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_l1.algorithms import METRPO
+from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.experiment.run_directory import RunDirectory, save_atomically, versions
 from torchrl_l1.experiment.schema import METRPORecipe, algorithm_config, l1_config
 from torchrl_l1.experiment.tracking import Tracker, check_mode
@@ -64,7 +66,19 @@ def build(recipe: METRPORecipe) -> METRPO:
         seed=recipe.seed,
         horizon=recipe.horizon,
         device=recipe.device,
+        compile_l1=compile_mode(recipe.l1.compile),
     )
+
+
+def compile_mode(setting: bool | str) -> CompileMode:
+    """Check ``l1.compile``.
+
+    Raises:
+        ValueError: if it is none of true, false and auto.
+    """
+    if setting not in (True, False, "auto"):
+        raise ValueError(f"l1.compile must be true, false or auto, got {setting!r}")
+    return setting  # type: ignore[return-value]
 
 
 def _run(
@@ -94,22 +108,24 @@ def _run(
         directory.path,
         run_id,
     )
-    for result in algorithm.iterate():
-        rows.append(result.metrics)
-        timings.append({"iteration": result.metrics["iteration"], **result.seconds})
-        directory.save_checkpoint(
-            {"algorithm": algorithm.state_dict(), "metrics": rows, "timings": timings}
-        )
-        directory.write_table(directory.metrics_file, rows)
-        directory.write_table(directory.timing_file, timings)
-        save_atomically(directory.path / "model.pt", algorithm.dynamics.state_dict())
-        save_atomically(directory.path / "policy.pt", algorithm.policy.state_dict())
-        seconds = {f"seconds/{phase}": value for phase, value in result.seconds.items()}
-        tracker.log({**result.metrics, **seconds}, step=len(rows) - 1)
-        progress.update()
-        progress.write(
-            f"iteration {len(rows) - 1}: {result.metrics['real_steps']} real steps, "
-            f"return {result.metrics['return_mean']:.2f} "
-            f"(deterministic {result.metrics['return_deterministic']:.2f})"
-        )
-    tracker.finish()
+    with closing(tracker):
+        if rows:
+            # A kill may have come between the last checkpoint and its log entry.
+            tracker.log(rows[-1], timings[-1])
+        for result in algorithm.iterate():
+            rows.append(result.metrics)
+            timings.append({"iteration": result.metrics["iteration"], **result.seconds})
+            directory.save_checkpoint(
+                {"algorithm": algorithm.state_dict(), "metrics": rows, "timings": timings}
+            )
+            directory.write_table(directory.metrics_file, rows)
+            directory.write_table(directory.timing_file, timings)
+            save_atomically(directory.path / "model.pt", algorithm.dynamics.state_dict())
+            save_atomically(directory.path / "policy.pt", algorithm.policy.state_dict())
+            tracker.log(rows[-1], timings[-1])
+            progress.update()
+            progress.write(
+                f"iteration {len(rows) - 1}: {result.metrics['real_steps']} real steps, "
+                f"return {result.metrics['return_mean']:.2f} "
+                f"(deterministic {result.metrics['return_deterministic']:.2f})"
+            )

@@ -25,6 +25,9 @@ PACKAGES = ("torchrl-l1", "torch", "tensordict", "torchrl", "gymnasium", "mujoco
 # What a run killed in its first moments may leave behind; its directory is still free.
 _BEFORE_CONFIG = (".lock", "versions.json", "versions.json.tmp", "config.yaml.tmp")
 
+# A run that is asked for more iterations than it had continues; no other setting may change.
+_MAY_GROW = "outer_iterations"
+
 
 class RunDirectoryError(Exception):
     """The run directory cannot be used as asked; the message says why and what to do."""
@@ -35,8 +38,8 @@ class RunDirectory:
 
     ``config.yaml`` (resolved), ``versions.json``, ``metrics.csv`` (one row per outer iteration,
     the source of truth), ``timing.csv`` (wall-clock seconds by phase), ``checkpoint.pt``,
-    ``model.pt``, ``policy.pt``, and W&B's own files. All but the CSVs are replaced atomically;
-    the CSVs are rewritten from the checkpoint's rows when a run resumes.
+    ``model.pt``, ``policy.pt``, and W&B's own files. All are replaced atomically; the CSVs are
+    rewritten from the checkpoint's rows when a run resumes.
 
     Args:
         path: the directory.
@@ -77,13 +80,21 @@ class RunDirectory:
                 raise RunDirectoryError(f"another process is running in {self.path}") from error
             if not self.config_file.exists():
                 write_atomically(self.path / "versions.json", json.dumps(versions(), indent=2))
+            if self._stored().get(_MAY_GROW) != config.get(_MAY_GROW) or not resume:
                 write_atomically(self.config_file, OmegaConf.to_yaml(OmegaConf.create(config)))
             yield
 
-    def _check_same(self, config: dict[str, Any]) -> None:
+    def _stored(self) -> dict[str, Any]:
+        if not self.config_file.exists():
+            return {}
         stored = OmegaConf.to_container(OmegaConf.load(self.config_file))
         assert isinstance(stored, dict)
-        before, now = _flatten(stored), _flatten(config)
+        return {str(key): value for key, value in stored.items()}
+
+    def _check_same(self, config: dict[str, Any]) -> None:
+        before, now = _flatten(self._stored()), _flatten(config)
+        if before.get(_MAY_GROW, 0) < now.get(_MAY_GROW, 0):
+            before[_MAY_GROW] = now[_MAY_GROW]
         different = [
             f"{key}: {before.get(key, '(absent)')} there, {now.get(key, '(absent)')} now"
             for key in sorted(before.keys() | now.keys())

@@ -25,6 +25,9 @@ class L1Settings:
         on_switch: ``keep`` or ``reset`` predictor and filter at a switch.
         switch_on: the switching law looks at the ``policy`` action or the ``executed`` input.
         filter_input: the filter takes the ``current`` or the ``previous`` estimate.
+        project: bound the estimate that enters the filter to the range of the action.
+        compile: compile the controller's step: ``true``, ``false``, or ``auto`` where a compiler
+            works. It takes some tens of seconds and pays in long collections.
     """
 
     enabled: bool = False
@@ -35,6 +38,8 @@ class L1Settings:
     on_switch: str = "keep"
     switch_on: str = "executed"
     filter_input: str = "previous"
+    project: bool = True
+    compile: bool | str = False
 
 
 @dataclass
@@ -64,6 +69,8 @@ class RunSettings:
         threads: CPU threads of torch.
         device: ``cpu``, ``cuda`` or ``auto`` (CUDA where there is one).
         horizon: steps per real episode; the task's own if null.
+        published_episodes: real episodes per iteration of the published runs, for
+            ``preset=paper``.
         published_horizon: imagined horizon of the published runs, for ``preset=paper``.
         l1: see :class:`L1Settings`.
         perturbation: noise and disturbances of the real environment.
@@ -79,6 +86,7 @@ class RunSettings:
     device: str = "cpu"
     horizon: int | None = None
     published_horizon: int = 1000
+    published_episodes: int = 6
     l1: L1Settings = field(default_factory=L1Settings)
     perturbation: Perturbation = field(default_factory=Perturbation)
     wandb: WandbSettings = field(default_factory=WandbSettings)
@@ -90,7 +98,7 @@ class METRPORecipe(RunSettings, METRPOConfig):
 
 
 # Keys that may differ between a run and its continuation: they do not touch the result.
-VOLATILE_KEYS = ("run_dir", "resume", "wandb", "threads")
+VOLATILE_KEYS = ("run_dir", "resume", "wandb")
 
 
 def register() -> None:
@@ -121,6 +129,7 @@ def l1_config(settings: L1Settings, task_name: str) -> L1Config | None:
         on_switch=settings.on_switch,  # type: ignore[arg-type]
         switch_on=settings.switch_on,  # type: ignore[arg-type]
         filter_input=settings.filter_input,  # type: ignore[arg-type]
+        project=settings.project,
         action_low=task.action_low,
         action_high=task.action_high,
     )

@@ -44,11 +44,13 @@ class Tracker:
             settings=wandb.Settings(silent=True, console="off"),
         )
 
-    def log(self, metrics: Mapping[str, Any], step: int) -> None:
-        """Log one dictionary at one step."""
-        self._run.log(dict(metrics), step=step)
+    def log(self, metrics: Mapping[str, Any], timing: Mapping[str, Any]) -> None:
+        """Log one outer iteration as one dictionary."""
+        seconds = {f"seconds/{phase}": value for phase, value in timing.items()}
+        del seconds["seconds/iteration"]
+        self._run.log({**metrics, **seconds}, step=int(metrics["iteration"]))
 
-    def finish(self) -> None:
+    def close(self) -> None:
         """Flush and close."""
         self._run.finish()
 

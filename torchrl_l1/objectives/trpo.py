@@ -35,6 +35,22 @@ class TRPOConfig:
     max_backtracks: int = 15
     accept_ratio: float = 0.1
 
+    def __post_init__(self) -> None:
+        """Refuse settings that could only fail later.
+
+        Raises:
+            ValueError: naming the setting.
+        """
+        for name in ("max_kl", "cg_iterations", "max_backtracks"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"trpo.{name} must be positive, got {getattr(self, name)}")
+        if self.damping < 0:
+            raise ValueError(f"trpo.damping must not be negative, got {self.damping}")
+        if not 0 < self.fisher_fraction <= 1:
+            raise ValueError(f"trpo.fisher_fraction must be in (0, 1], got {self.fisher_fraction}")
+        if not 0 < self.backtrack_ratio < 1:
+            raise ValueError(f"trpo.backtrack_ratio must be in (0, 1), got {self.backtrack_ratio}")
+
 
 @dataclass
 class TRPOReport:

@@ -1,0 +1,48 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_l1.algorithms.advantages import imagined_advantages
+
+GAMMA, LAMBDA = 0.9, 0.8
+
+
+def trajectories() -> TensorDict:
+    """Two trajectories of five steps; the second leaves the box in its third."""
+    torch.manual_seed(0)
+    left = torch.zeros(2, 5, 1, dtype=torch.bool)
+    left[1, 2] = True
+    done = left.clone()
+    done[:, -1] = True
+    return TensorDict(
+        {"next": {"reward": torch.randn(2, 5, 1), "done": done, "terminated": left}},
+        batch_size=[2, 5],
+    )
+
+
+def loop(rewards: list[float], values: list[float], last_value: float) -> list[float]:
+    """The definition: a discounted sum of temporal differences."""
+    following = [*values[1:], last_value]
+    advantage, result = 0.0, []
+    for r, v, w in reversed(list(zip(rewards, values, following, strict=True))):
+        advantage = r + GAMMA * w - v + GAMMA * LAMBDA * advantage
+        result.append(advantage)
+    return result[::-1]
+
+
+@pytest.mark.parametrize("box_exit", ["truncate", "fail"])
+def test_advantages_follow_the_definition(box_exit: str) -> None:
+    data = trajectories()
+    value = torch.randn(2, 5, 1)
+    value[1, 3] = value[1, 2]  # after an exit the observation stays
+    advantage, target = imagined_advantages(data, value, GAMMA, LAMBDA, box_exit)
+    rewards, values = data["next", "reward"][..., 0].tolist(), value[..., 0].tolist()
+    # To the horizon nothing is bootstrapped.
+    whole = loop(rewards[0], values[0], last_value=0.0)
+    torch.testing.assert_close(advantage[0, :, 0], torch.tensor(whole))
+    beyond = values[1][2] if box_exit == "truncate" else 0.0
+    until_exit = loop(rewards[1][:3], values[1][:3], last_value=beyond)
+    torch.testing.assert_close(advantage[1, :3, 0], torch.tensor(until_exit))
+    torch.testing.assert_close(target, advantage + value)

@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchrl_l1.cli import main
+from torchrl_l1.experiment.launch import split_flags
+
+TINY = [
+    *("outer_iterations=1", "episodes_per_iteration=2", "horizon=15", "trpo_iterations=1"),
+    *("imagined_steps=100", "imagined_horizon=10", "model.members=2", "model.hidden=[8]"),
+    *("policy.hidden=[8]", "fit.batch_size=16", "fit.max_epochs=1", "wandb.mode=disabled"),
+]
+RUN = ["run", "metrpo/inverted_pendulum", *TINY]
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit) as exit_info:
+        main(arguments)
+    assert exit_info.value.code not in (0, None)
+    printed = capsys.readouterr()
+    assert "Traceback" not in printed.err
+    return printed.err
+
+
+def test_run_resume_and_refusals(capsys: pytest.CaptureFixture[str]) -> None:
+    main([*RUN, "run_dir=here"])
+    assert "here/metrics.csv" in capsys.readouterr().out
+    before = {file: file.read_bytes() for file in Path("here").rglob("*") if file.is_file()}
+    assert "already holds a run" in refused([*RUN, "run_dir=here"], capsys)
+    message = refused([*RUN, "run_dir=here", "seed=9", "--resume"], capsys)
+    assert "another configuration" in message
+    assert "seed: 0 there, 9 now" in message
+    assert "label must be" in refused([*RUN, "run_dir=there", "label=both"], capsys)
+    main(["run", "--resume", *RUN[1:], "run_dir=here"])
+    assert "nothing to do" in capsys.readouterr().out
+    after = {file: file.read_bytes() for file in Path("here").rglob("*") if file.is_file()}
+    assert after == before
+    assert not Path("there").exists()
+
+
+def test_sweep_runs_every_combination() -> None:
+    main([*RUN, "-m", "seed=0,1", "run_dir=swept/${label}_${seed}", "label=nominal"])
+    assert {path.name for path in Path("swept").iterdir()} == {"nominal_0", "nominal_1"}
+
+
+def test_default_run_directory_names_recipe_overrides_and_seed() -> None:
+    main(["run", "metrpo/inverted_pendulum", "seed=4", *TINY, "l1=off"])
+    (metrics,) = Path("runs/metrpo/inverted_pendulum").rglob("metrics.csv")
+    assert metrics.parent.name == "seed_4"
+    assert "l1=off" in metrics.parent.parent.name
+    with metrics.open() as file:
+        assert "l1/u_a" not in next(csv.reader(file))
+
+
+def test_flags_may_stand_anywhere() -> None:
+    arguments = ["seed=1", "--cfg", "job", "-p", "l1", "-m", "l1=off"]
+    assert split_flags(arguments) == (["--cfg", "job", "-p", "l1", "-m"], ["seed=1", "l1=off"])
+
+
+def test_composed_recipe_can_be_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    main([*RUN, "seed=7", "--cfg", "job"])
+    assert "seed: 7" in capsys.readouterr().out
+    assert not list(Path().iterdir())
+
+
+def test_verify_exits_by_its_verdict(capsys: pytest.CaptureFixture[str]) -> None:
+    steps, trace = 5, {}
+    trace["obs"] = np.zeros((steps, 2))
+    trace["drift"] = np.ones((steps, 2))
+    trace["jac"] = np.ones((steps, 2, 1))
+    for name in ("action", "u", "sigma_m"):
+        trace[name] = np.zeros((steps, 1))
+    trace["x_hat"] = np.ones((steps, 2))
+    trace["switch"] = np.ones(steps, dtype=bool)
+    scalars = {"dt": np.array(0.1), "bound": np.array(1.0)}
+    trace |= scalars
+    # Restarted at each step with a zero action, the controller predicts x + drift.
+    np.savez("good.npz", **{f"plant/case/{key}": value for key, value in trace.items()})
+    main(["verify", "good.npz"])
+    assert "1 of 1 traces" in capsys.readouterr().out
+    trace["x_hat"] = trace["x_hat"] + 1e-3
+    np.savez("bad.npz", **{f"plant/case/{key}": value for key, value in trace.items()})
+    with pytest.raises(SystemExit) as exit_info:
+        main(["verify", "bad.npz"])
+    assert exit_info.value.code == 1
+    assert "TOO LARGE" in capsys.readouterr().out
+
+
+def test_unknown_command_and_option_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "invalid choice" in refused(["train"], capsys)
+    assert "unrecognized" in refused(["evaluate", "x", "--loud"], capsys)
+
+
+def test_arguments_are_left_as_they_were() -> None:
+    before = list(sys.argv)
+    main([*RUN, "--cfg", "job"])
+    assert sys.argv == before
