@@ -14,29 +14,11 @@ from benchmarks.tables import Table
 RESULTS = Path(__file__).parent / "results"
 
 
-def _stepping(repetitions: int) -> Table:
-    return Table(
-        "env_stepping",
-        "Environment stepping",
-        "Environment steps per second, median (range): the batched environment and "
-        "`SerialEnv(GymEnv)`, one thread.",
-        env_stepping.run(repetitions),
-        {
-            "task": "task",
-            "num_envs": "environments",
-            "batched": "batched",
-            "serial": "SerialEnv",
-            "ratio": "ratio",
-        },
-        {"batched": ",.0f", "serial": ",.0f", "ratio": ".1f"},
-    )
-
-
 # Name: (threads, default repetitions, measurement).
 BENCHMARKS: dict[str, tuple[int, int, Callable[[int], Table]]] = {
     "jacobian": (jacobian.THREADS, 21, jacobian.table),
-    "env_stepping": (1, 9, _stepping),
-    "collection": (collection.THREADS, 15, collection.table),
+    "env_stepping": (env_stepping.THREADS, 9, env_stepping.table),
+    "collection": (collection.THREADS, 7, collection.table),
 }
 
 

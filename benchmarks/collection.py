@@ -4,31 +4,52 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+import torch
+from tensordict import TensorDictBase
 from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import Transform
 
 from benchmarks.tables import Table
 from benchmarks.timing import Row, interleave, ratio, spread
-from torchrl_l1.algorithms.policy import GaussianPolicy, make_actor
+from torchrl_l1.algorithms.policy import GaussianPolicy, clipped, make_actor
 from torchrl_l1.control import L1Transform
-from torchrl_l1.dynamics import EnsembleDynamics
-from torchrl_l1.envs import get_task, make_env
+from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, fit_ensemble
+from torchrl_l1.envs import Task, get_task, make_env
 
-SETTINGS = (("inverted_pendulum", 25, 1.0), ("half_cheetah", 6, 3.0))
+SETTINGS = (("inverted_pendulum", 25, 1.0), ("half_cheetah", 6, 3.0), ("half_cheetah", 25, 3.0))
 """Task, number of environments, epsilon."""
 
-THREADS = 1
+WIDTHS = (200, 256)
+"""Units of each of the model's two hidden layers."""
+
+THREADS = 2
 STEPS = 100
+FIT = FitConfig(max_gradient_steps=300)
 
 
-def _batches(name: str, num_envs: int, transforms: list[Transform]) -> Iterator[object]:
-    """Endless batches of ``STEPS`` steps of every environment."""
-    env = make_env(name, num_envs, extra_transforms=transforms, seed=0)
-    task = get_task(name)
-    actor = make_actor(GaussianPolicy(task.observation_dim, task.action_dim, [32, 32], 1.0))
+def fitted_model(task: Task, width: int, fit: FitConfig) -> EnsembleDynamics:
+    """A model of random data, as in the first iteration: an unfitted one would not switch."""
+    torch.manual_seed(0)
+    data = make_env(task, 25, seed=0).rollout(STEPS, break_when_any_done=False).reshape(-1)
+    items = data.select("observation", "action", ("next", "observation"))
+    items["validation"] = torch.rand(len(items)) < fit.validation_fraction
+    buffer = ReplayBuffer(storage=LazyTensorStorage(len(items)), batch_size=fit.batch_size)
+    buffer.extend(items)
+    model = EnsembleDynamics(task.observation_dim, task.action_dim, hidden=(width, width))
+    fit_ensemble(model, buffer, fit, torch.optim.Adam(model.parameters(), lr=fit.learning_rate))
+    return model
+
+
+def _batches(task: Task, num_envs: int, transforms: list[Transform]) -> Iterator[TensorDictBase]:
+    """Endless batches of ``STEPS`` steps of every environment, by an untrained policy."""
+    torch.manual_seed(0)
+    n, m = task.observation_dim, task.action_dim
+    actor = make_actor(GaussianPolicy(n, m, [32, 32], 1.0))
+    low, high = torch.full((m,), task.action_low), torch.full((m,), task.action_high)
     collector = Collector(
-        env,
-        actor,
+        make_env(task, num_envs, extra_transforms=transforms, seed=0),
+        clipped(actor, low, high),
         frames_per_batch=STEPS * num_envs,
         total_frames=-1,
         auto_register_policy_transforms=False,
@@ -37,36 +58,46 @@ def _batches(name: str, num_envs: int, transforms: list[Transform]) -> Iterator[
 
 
 def run(repetitions: int) -> list[Row]:
-    """Measure both tasks.
+    """Measure all settings.
 
     Args:
         repetitions: interleaved measurements of each variant; one is a batch of the collector.
 
     Returns:
-        One row per task: real steps per second with L1 ``off``, on and ``eager``, on and
-        ``compiled``; ``eager_ratio`` and ``compiled_ratio`` are fractions of the speed without L1.
+        One row per setting and width: switches per 1000 steps (``switches``), real steps per second
+        with L1 ``off``, on and ``eager``, on and ``compiled``; ``eager_ratio`` and
+        ``compiled_ratio`` are fractions of the speed without L1.
     """
     rows: list[Row] = []
+    models: dict[tuple[str, int], EnsembleDynamics] = {}
     for name, num_envs, epsilon in SETTINGS:
         task = get_task(name)
-        model = EnsembleDynamics(task.observation_dim, task.action_dim)
-        variants: dict[str, list[Transform]] = {
-            "off": [],
-            "eager": [L1Transform(model, dt=task.dt, epsilon=epsilon, compile=False)],
-            "compiled": [L1Transform(model, dt=task.dt, epsilon=epsilon, compile=True)],
-        }
-        cases: dict[str, Callable[[], object]] = {
-            variant: _batches(name, num_envs, transforms).__next__
-            for variant, transforms in variants.items()
-        }
-        seconds = interleave(cases, repetitions)
-        frames = STEPS * num_envs
-        row: Row = {"task": name, "num_envs": num_envs}
-        for variant, values in seconds.items():
-            row |= spread(variant, [frames / value for value in values])
-        for variant in ("eager", "compiled"):
-            row |= ratio(f"{variant}_ratio", seconds["off"], seconds[variant])
-        rows.append(row)
+        for width in WIDTHS:
+            if (name, width) not in models:
+                models[name, width] = fitted_model(task, width, FIT)
+            model = models[name, width]
+            variants: dict[str, list[Transform]] = {
+                "off": [],
+                "eager": [L1Transform(model, dt=task.dt, epsilon=epsilon)],
+                "compiled": [L1Transform(model, dt=task.dt, epsilon=epsilon, compile="auto")],
+            }
+            batches = {
+                variant: _batches(task, num_envs, transforms)
+                for variant, transforms in variants.items()
+            }
+            switches = next(batches["eager"])["next", "l1", "switch"].float().mean().item()
+            cases: dict[str, Callable[[], object]] = {
+                variant: iterator.__next__ for variant, iterator in batches.items()
+            }
+            # Two batches to warm up: torch compiles at the first.
+            seconds = interleave(cases, repetitions)
+            row: Row = {"task": name, "num_envs": num_envs, "model": f"2 x {width}"}
+            row["switches"] = 1000 * switches
+            for variant, values in seconds.items():
+                row |= spread(variant, [STEPS * num_envs / value for value in values])
+            for variant in ("eager", "compiled"):
+                row |= ratio(f"{variant}_ratio", seconds["off"], seconds[variant])
+            rows.append(row)
     return rows
 
 
@@ -76,17 +107,19 @@ def table(repetitions: int) -> Table:
         "collection",
         "Collection with L1 on and off",
         "Real steps per second of a `Collector`, median (range); the ratios are fractions of the "
-        "speed without L1. The model has five members of 2 x 256 ReLU units. Where there is no "
-        "compiler, `compiled` runs eagerly.",
+        "speed without L1. Five members of ReLU units, fitted to random data; an untrained policy. "
+        "Where there is no working compiler, `compiled` runs eagerly.",
         run(repetitions),
         {
             "task": "task",
             "num_envs": "environments",
+            "model": "model",
+            "switches": "switches per 1000 steps",
             "off": "L1 off",
             "eager": "L1 on, eager",
             "compiled": "L1 on, compiled",
             "eager_ratio": "eager / off",
             "compiled_ratio": "compiled / off",
         },
-        dict.fromkeys(("off", "eager", "compiled"), ",.0f"),
+        dict.fromkeys(("off", "eager", "compiled", "switches"), ",.0f"),
     )

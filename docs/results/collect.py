@@ -59,13 +59,16 @@ def read(file: Path) -> list[dict[str, float]]:
         return [{k: float(v) for k, v in row.items()} for row in csv.DictReader(handle)]
 
 
-def write(name: str, header: Sequence[str], rows: Sequence[Sequence[object]], note: str) -> None:
-    """NAME.csv and NAME.md."""
+def write(
+    name: str, header: Sequence[str], rows: Sequence[Sequence[object]], note: str, after: str = ""
+) -> None:
+    """NAME.csv and NAME.md: table, note, figure, and what comes after the figure."""
     with (HERE / f"{name}.csv").open("w", newline="") as handle:
         csv.writer(handle, lineterminator="\n").writerows([header, *rows])
     lines = [f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
     lines += [f"| {' | '.join(map(str, row))} |" for row in rows]
     text = "\n".join([*lines, "", note, "", f"![{name}](results/{name}.png)", ""])
+    text += after
     (HERE / f"{name}.md").write_text(text)
     print(text)
 
@@ -117,32 +120,48 @@ def labels(folders: Sequence[str]) -> None:
     ]
     colors = {"executed": "tab:blue", "nominal": "tab:red"}
     curves("labels", runs, lambda run: colors[run.label], "label", symlog=True)
-    write(
-        "labels",
-        [*header, "last, mean action", "switches per 1000 steps, last"],
-        rows,
-        environment(runs[0]),
-    )
+    write("labels", [*header, "switches per 1000 steps, last"], rows, environment(runs[0]))
 
 
 def half_cheetah(folders: Sequence[str]) -> None:
     """The baseline: HalfCheetah without L1."""
     runs = sorted(map(load, folders), key=lambda run: run.seed)
-    rows: list[list[object]] = []
+    rows = []
     for run in runs:
         last = [fmean(run.column(c)[-3:]) for c in ("return_mean", "return_deterministic")]
-        seconds = sum(sum(v for k, v in row.items() if k != "iteration") for row in run.timing)
-        steps = run.metrics[-1]["real_steps"]
-        rows.append([run.seed, *(round(v) for v in last), round(1000 * seconds / steps, 2)])
-    for name, aggregate in (("mean", fmean), ("standard deviation", stdev)):
-        values = [aggregate([float(row[c]) for row in rows]) for c in (1, 2, 3)]  # type: ignore[arg-type]
-        rows.append([name, round(values[0]), round(values[1]), round(values[2], 2)])
-        if name == "mean":
-            mean_row = rows.pop()
-    rows.insert(len(rows) - 1, mean_row)
+        rows.append([run.seed, *last, *milliseconds(run)])
+    columns = list(zip(*rows, strict=True))[1:]
+    cells = [[row[0], *rounded(row[1:])] for row in rows]
+    cells.append(["mean", *rounded([fmean(column) for column in columns])])
+    if len(runs) > 1:
+        cells.append(["standard deviation", *rounded([stdev(column) for column in columns])])
     curves("half_cheetah", runs, lambda run: f"C{run.seed}", "seed", symlog=False)
-    header = ["seed", "return, last three iterations", "with the mean action", "ms per real step"]
-    write("half_cheetah", header, rows, environment(runs[0]))
+    header = [
+        "seed",
+        "return, last three iterations",
+        "with the mean action",
+        "ms per real step",
+        "ms per real step, all",
+    ]
+    note = (
+        "Milliseconds per real step count fit, TRPO and collection with its random data; `all` "
+        "adds the extra episodes with the mean action, which no data come from."
+    )
+    write("half_cheetah", header, cells, f"{note} {environment(runs[0])}")
+
+
+def milliseconds(run: Run) -> tuple[float, float]:
+    """Milliseconds per real step: fit, TRPO and collection, and with the evaluation."""
+    phases = {name for row in run.timing for name in row} - {"iteration"}
+    totals = {name: sum(row[name] for row in run.timing) for name in phases}
+    everything = sum(totals.values())
+    scale = 1000 / run.metrics[-1]["real_steps"]
+    return scale * (everything - totals["evaluate"]), scale * everything
+
+
+def rounded(row: Sequence[float]) -> list[str]:
+    """Two returns in full units, two times in hundredths."""
+    return [*(f"{value:.0f}" for value in row[:2]), *(f"{value:.2f}" for value in row[2:])]
 
 
 def robustness(folders: Sequence[str]) -> None:
@@ -171,7 +190,16 @@ def robustness(folders: Sequence[str]) -> None:
         f"Mean return: median [lowest, highest] of {seeds} training seeds, {episodes} episodes "
         "each. The action bound is 3."
     )
-    write("robustness", ["policy", "bias", *names], rows, note)
+    write("robustness", ["policy", "bias", *names], rows, note, filmstrip_figure(summary))
+
+
+def filmstrip_figure(summary: Sequence[dict[str, str]]) -> str:
+    """The filmstrip with a caption, or nothing where it could not be rendered."""
+    if not (HERE / "filmstrip.png").exists():
+        return ""
+    worst = max((float(row["bias"]) for row in summary), key=abs)
+    caption = f"The first training seed's policy (mean action) at a bias of {worst:g}."
+    return f"\n![filmstrip](results/filmstrip.png)\n\n*{caption}*\n"
 
 
 if __name__ == "__main__":

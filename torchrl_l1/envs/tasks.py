@@ -1,7 +1,7 @@
 """The benchmark tasks: one table of facts that physics, rewards and imagination share.
 
-A :class:`Task` says everything that distinguishes one benchmark from another. On both tasks here the
-real environment (:class:`~torchrl_l1.envs.BatchedMujocoEnv`) and the imagined rollouts of a
+A :class:`Task` says everything that distinguishes one benchmark from another. On both tasks here
+the real environment (:class:`~torchrl_l1.envs.BatchedMujocoEnv`) and the imagined rollouts of a
 model-based algorithm evaluate the *same* reward function, so they cannot drift apart. A task may
 differ in that: imagination asks for :attr:`Task.imagined_reward`. The facts follow the authors'
 released code for arXiv 2403.14860, which builds on MBBL (arXiv:1907.02057); they differ from the
@@ -58,6 +58,7 @@ class Task:
         reward: ``(observation (..., n), action (..., m), next_observation (..., n)) -> (...)``
             in torch; ``observation`` is the state *before* the step.
         terminated: ``next_observation (..., n) -> bool (...)`` in torch; never by default.
+        reward_in_imagination: reward of imagined rollouts where it is not the real one.
         patch: optional edit of the :class:`mujoco.MjSpec` before it is compiled.
 
     Examples:
@@ -83,17 +84,18 @@ class Task:
     sample_reset: ResetFn
     reward: RewardFn
     terminated: Callable[[Tensor], Tensor] = _never
+    reward_in_imagination: RewardFn | None = None
     patch: Callable[[mujoco.MjSpec], None] | None = None
+
+    @property
+    def imagined_reward(self) -> RewardFn:
+        """Reward of imagined rollouts: the real one unless the task says otherwise."""
+        return self.reward_in_imagination or self.reward
 
     @property
     def dt(self) -> float:
         """Duration of one environment step in seconds."""
         return self.timestep * self.frame_skip
-
-    @property
-    def imagined_reward(self) -> RewardFn:
-        """Reward of imagined rollouts: the real one."""
-        return self.reward
 
     @property
     def model_path(self) -> Path:

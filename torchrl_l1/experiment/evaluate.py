@@ -89,8 +89,8 @@ def conditions(
 ) -> list[Condition]:
     """Every combination of controller, noise and policy with each bias and, apart, each gain."""
     disturbances = [(b, 1.0) for b in bias] + [(0.0, g) for g in gain if g != 1.0]
-    cells = product(*map(dict.fromkeys, (policy, noise, disturbances, l1)))
-    return [Condition(on, n, b, g, p) for p, n, (b, g), on in cells]
+    cells = product(policy, noise, disturbances, l1)
+    return list(dict.fromkeys(Condition(on, n, b, g, p) for p, n, (b, g), on in cells))
 
 
 def evaluate(
