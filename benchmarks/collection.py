@@ -14,6 +14,7 @@ from benchmarks.tables import Table
 from benchmarks.timing import Row, interleave, ratio, spread
 from torchrl_l1.algorithms.policy import GaussianPolicy, clipped, make_actor
 from torchrl_l1.control import L1Transform
+from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, fit_ensemble
 from torchrl_l1.envs import Task, get_task, make_env
 
@@ -22,6 +23,9 @@ SETTINGS = (("inverted_pendulum", 25, 1.0), ("half_cheetah", 6, 3.0), ("half_che
 
 WIDTHS = (200, 256)
 """Units of each of the model's two hidden layers."""
+
+COMPILE: dict[str, CompileMode] = {"eager": False, "compiled": "auto"}
+"""Variants with L1 on."""
 
 THREADS = 2
 STEPS = 100
@@ -76,10 +80,9 @@ def run(repetitions: int) -> list[Row]:
             if (name, width) not in models:
                 models[name, width] = fitted_model(task, width, FIT)
             model = models[name, width]
-            variants: dict[str, list[Transform]] = {
-                "off": [],
-                "eager": [L1Transform(model, dt=task.dt, epsilon=epsilon)],
-                "compiled": [L1Transform(model, dt=task.dt, epsilon=epsilon, compile="auto")],
+            variants: dict[str, list[Transform]] = {"off": []} | {
+                variant: [L1Transform(model, dt=task.dt, epsilon=epsilon, compile=mode)]
+                for variant, mode in COMPILE.items()
             }
             batches = {
                 variant: _batches(task, num_envs, transforms)
@@ -95,7 +98,7 @@ def run(repetitions: int) -> list[Row]:
             row["switches"] = 1000 * switches
             for variant, values in seconds.items():
                 row |= spread(variant, [STEPS * num_envs / value for value in values])
-            for variant in ("eager", "compiled"):
+            for variant in COMPILE:
                 row |= ratio(f"{variant}_ratio", seconds["off"], seconds[variant])
             rows.append(row)
     return rows

@@ -2,7 +2,7 @@
 
     python docs/results/collect.py labels runs/labels/*
     python docs/results/collect.py half_cheetah runs/half_cheetah/*
-    python docs/results/collect.py robustness runs/robustness/seed_0/evaluation
+    python docs/results/collect.py robustness runs/robustness/evaluation
 
 Writes NAME.md, NAME.csv and NAME.png beside this file; the pages include them.
 """
@@ -145,7 +145,7 @@ def half_cheetah(folders: Sequence[str]) -> None:
     ]
     note = (
         "Milliseconds per real step count fit, TRPO and collection with its random data; `all` "
-        "adds the extra episodes with the mean action, which no data come from."
+        "adds the episodes that only measure returns."
     )
     write("half_cheetah", header, cells, f"{note} {environment(runs[0])}")
 

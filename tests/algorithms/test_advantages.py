@@ -37,10 +37,10 @@ def test_advantages_follow_the_definition(box_exit: str) -> None:
     data = trajectories()
     value = torch.randn(2, 5, 1)
     value[1, 3] = value[1, 2]  # after an exit the observation stays
-    advantage, target = imagined_advantages(data, value, GAMMA, LAMBDA, box_exit)
+    last_value = torch.tensor([0.7, -0.4]).reshape(2, 1, 1)
+    advantage, target = imagined_advantages(data, value, last_value, GAMMA, LAMBDA, box_exit)
     rewards, values = data["next", "reward"][..., 0].tolist(), value[..., 0].tolist()
-    # To the horizon nothing is bootstrapped.
-    whole = loop(rewards[0], values[0], last_value=0.0)
+    whole = loop(rewards[0], values[0], last_value=0.7)
     torch.testing.assert_close(advantage[0, :, 0], torch.tensor(whole))
     beyond = values[1][2] if box_exit == "truncate" else 0.0
     until_exit = loop(rewards[1][:3], values[1][:3], last_value=beyond)

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import jacobian
+from benchmarks import collection, env_stepping, jacobian
 from benchmarks.tables import Table
 from benchmarks.timing import interleave, ratio
+from torchrl_l1.dynamics import FitConfig
 
 
 def test_cases_take_turns() -> None:
@@ -40,3 +41,24 @@ def test_jacobian_benchmark_compares_equal_computations(monkeypatch: pytest.Monk
     (row,) = jacobian.run(1)
     assert {"forward", "analytic", "jvp", "jacfwd", "jacrev", "forwards"} <= row.keys()
     assert all(row[f"{rival}_ratio"] > 0 for rival in jacobian.RIVALS)
+
+
+def test_env_stepping_benchmark_measures_both_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(env_stepping, "NUM_ENVS", 2)
+    monkeypatch.setattr(env_stepping, "STEPS", 2)
+    rows = env_stepping.table(1).rows
+    assert [row["task"] for row in rows] == list(env_stepping.GYM_IDS)
+    assert all(row["ratio"] == pytest.approx(row["batched"] / row["serial"]) for row in rows)
+
+
+def test_collection_benchmark_switches_with_a_fitted_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A tolerance far below the model's curvature: switches are all but certain.
+    monkeypatch.setattr(collection, "SETTINGS", (("half_cheetah", 2, 1e-3),))
+    monkeypatch.setattr(collection, "WIDTHS", (8,))
+    monkeypatch.setattr(collection, "COMPILE", {"eager": False})
+    monkeypatch.setattr(collection, "STEPS", 10)
+    monkeypatch.setattr(collection, "FIT", FitConfig(batch_size=50, max_gradient_steps=20))
+    (row,) = collection.run(1)
+    assert row["model"] == "2 x 8"
+    assert row["switches"] > 100
+    assert row["eager_ratio"] > 0

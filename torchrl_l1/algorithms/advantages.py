@@ -9,18 +9,23 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 
 def imagined_advantages(
-    trajectories: TensorDictBase, value: Tensor, discount: float, gae_lambda: float, box_exit: str
+    trajectories: TensorDictBase,
+    value: Tensor,
+    last_value: Tensor,
+    discount: float,
+    gae_lambda: float,
+    box_exit: str,
 ) -> tuple[Tensor, Tensor]:
     """Generalized advantage estimate (arXiv 1506.02438) of trajectories that may end early.
 
-    Nothing is bootstrapped at the imagined horizon: the baseline knows the time. What follows an
-    exit from the data's box is unknown. To call it zero (``box_exit="fail"``) rewards leaving
-    wherever rewards are negative; ``"truncate"`` lets the value of the last state inside stand
-    for it.
+    What follows an exit from the data's box is unknown. To call it zero (``box_exit="fail"``)
+    rewards leaving wherever rewards are negative; ``"truncate"`` lets the value of the last state
+    inside stand for it.
 
     Args:
         trajectories: from :func:`~torchrl_l1.dynamics.imagine`, batch size ``[B, T]``.
         value: the baseline's value of each ``observation`` ``(B, T, 1)``.
+        last_value: what follows the last step ``(B, 1, 1)``: zero if the task ends there.
         discount: gamma.
         gae_lambda: lambda.
         box_exit: ``"truncate"`` or ``"fail"``.
@@ -30,11 +35,10 @@ def imagined_advantages(
     """
     done = trajectories["next", "done"]
     terminated = torch.zeros_like(done)
-    terminated[:, -1] = True
     if box_exit == "fail":
         terminated = terminated | trajectories["next", "terminated"]
     # After an exit the observation stays that of the last state inside, and so does its value.
-    next_value = torch.cat([value[:, 1:], torch.zeros_like(value[:, :1])], dim=1)
+    next_value = torch.cat([value[:, 1:], last_value], dim=1)
     advantage, target = generalized_advantage_estimate(
         discount,
         gae_lambda,

@@ -221,10 +221,16 @@ class METRPO:
             self.action_high,
         )
         observation, step = trajectories["observation"], trajectories["step"]
+        if config.bootstrap:
+            step = torch.zeros_like(step)
         with torch.no_grad():
             value = self.baseline(observation, step)
+            last_value = torch.zeros_like(value[:, :1])
+            if config.bootstrap:
+                last = trajectories["next", "observation"][:, -1:]
+                last_value = self.baseline(last, step[:, -1:])
         advantage, target = imagined_advantages(
-            trajectories, value, config.discount, config.gae_lambda, config.box_exit
+            trajectories, value, last_value, config.discount, config.gae_lambda, config.box_exit
         )
         valid = trajectories["valid"].squeeze(-1)
         samples = TensorDict(

@@ -59,6 +59,10 @@ class METRPOConfig:
         box_exit: what an imagined trajectory that leaves the box around the data is worth from
             there on: nothing (``fail``, the paper's MDP), or what the baseline says of its last
             state inside (``truncate``).
+        bootstrap: whether an imagined trajectory goes on in the baseline's estimate after its last
+            step, which then does not look at the time. Where the imagined horizon is shorter than
+            the task's, a policy that sees its world end there learns to risk everything in its
+            last steps.
         discount: gamma.
         gae_lambda: lambda of the generalized advantage estimate.
         label: action that the model is fitted to: ``nominal`` is the policy's (the paper's
@@ -78,6 +82,7 @@ class METRPOConfig:
     imagined_horizon: int = 200
     imagined_from_data: float = 0.0
     box_exit: str = "truncate"
+    bootstrap: bool = False
     discount: float = 0.99
     gae_lambda: float = 0.95
     label: str = "nominal"
