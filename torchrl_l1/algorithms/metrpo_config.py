@@ -66,7 +66,7 @@ class METRPOConfig:
         discount: gamma.
         gae_lambda: lambda of the generalized advantage estimate.
         label: action that the model is fitted to: ``nominal`` is the policy's (the paper's
-            choice), ``executed`` what the actuators received after L1.
+            choice), ``executed`` what L1 sends to the actuators.
         model: see :class:`ModelConfig`.
         policy: see :class:`PolicyConfig`.
         fit: see :class:`~torchrl_l1.dynamics.FitConfig`.
