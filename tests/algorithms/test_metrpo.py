@@ -109,20 +109,17 @@ def test_imagined_trajectories_start_where_the_configuration_says() -> None:
     assert starts[:30].abs().max() <= 0.01
 
 
-def test_a_few_iterations_learn_to_balance() -> None:
+def test_two_iterations_learn_to_balance() -> None:
     config = METRPOConfig(
-        outer_iterations=3,
-        episodes_per_iteration=15,
-        trpo_iterations=10,
+        outer_iterations=2,
+        episodes_per_iteration=20,
         imagined_steps=10_000,
         imagined_horizon=100,
         label="executed",
         model=ModelConfig(members=3, hidden=[64, 64]),
         policy=PolicyConfig(hidden=[32]),
-        fit=FitConfig(batch_size=200),
-        trpo=TRPOConfig(max_kl=0.03),
+        fit=FitConfig(batch_size=250),
     )
-    config.policy.std = 0.5
     last = list(METRPO("inverted_pendulum", config, seed=0).iterate())[-1].metrics
     assert last["return_deterministic"] > -20  # a random policy is at about -220
 
