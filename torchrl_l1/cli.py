@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         if options.command == "run":
             _run(options, rest)
         elif options.command == "evaluate":
-            from torchrl_l1.experiment.evaluate import evaluate_command
+            from torchrl_l1.experiment.evaluate_command import evaluate_command
 
             evaluate_command(options)
         elif options.command == "verify":

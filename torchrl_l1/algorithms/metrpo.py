@@ -28,6 +28,7 @@ from torchrl_l1.algorithms.collection import (
     return_metrics,
     signal_metrics,
 )
+from torchrl_l1.algorithms.device import resolve_device
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig
 from torchrl_l1.algorithms.metrpo_metrics import PolicyStep, fit_metrics, policy_metrics
 from torchrl_l1.algorithms.policy import GaussianPolicy, clipped, make_actor
@@ -280,18 +281,6 @@ class METRPO:
         self.buffer.empty()
         if state["buffer"]:
             self.buffer.extend(TensorDict(state["buffer"]).auto_batch_size_(1))
-
-
-def resolve_device(name: str) -> torch.device:
-    """``auto`` is CUDA where there is one; a device that is not there is a ``ValueError``."""
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    if name not in ("cpu", "cuda"):
-        raise ValueError(f"device must be cpu, cuda or auto, got {name!r}")
-    device = torch.device(name)
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError("device=cuda was asked for, but torch finds no CUDA device; use cpu")
-    return device
 
 
 def _standardize(advantage: torch.Tensor) -> torch.Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -10,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
-from tqdm import tqdm
 
 from torchrl_l1.algorithms.collection import (
     Collection,
@@ -22,7 +20,7 @@ from torchrl_l1.algorithms.metrpo import METRPO
 from torchrl_l1.experiment.recipes import shared_dir
 from torchrl_l1.experiment.run import build
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
-from torchrl_l1.experiment.schema import L1Settings, METRPORecipe, WandbSettings, l1_config
+from torchrl_l1.experiment.schema import L1Settings, METRPORecipe, l1_config
 
 
 @dataclass(frozen=True)
@@ -135,55 +133,3 @@ def make_collection(
         perturbation,
         trained.recipe.horizon,
     )
-
-
-def _check_one_study(runs: Sequence[TrainedRun]) -> None:
-    """Runs may differ in their seed and in nothing that matters."""
-
-    def settings(trained: TrainedRun) -> METRPORecipe:
-        return replace(trained.recipe, seed=0, run_dir="", resume=False, wandb=WandbSettings())
-
-    for trained in runs[1:]:
-        if settings(trained) != settings(runs[0]):
-            raise ValueError(
-                f"{runs[0].path} and {trained.path} differ in more than their seed; evaluate them "
-                "one at a time"
-            )
-
-
-def evaluate_command(options: argparse.Namespace) -> None:
-    """``torchrl-l1 evaluate``: table on the screen, CSV, PNG and, if asked, a filmstrip."""
-    # Plotting takes a second to import; errors in the request should not wait for it.
-    cells = conditions(options.l1, options.noise, options.bias, options.gain, options.policy)
-    for name in options.l1:
-        group_setting("l1", name)
-    for name in options.noise:
-        group_setting("noise", name)
-    if options.episodes < 1:
-        raise ValueError(f"--episodes must be positive, got {options.episodes}")
-    runs = [load_run(path) for path in dict.fromkeys(map(Path, options.run_dir))]
-    _check_one_study(runs)
-    output = Path(options.output) if options.output else runs[0].path / "evaluation"
-    rows = []
-    total = len(runs) * len(cells)
-    with tqdm(total=total, desc="evaluate", unit="cell", disable=None) as progress:
-        for trained in runs:
-            for row in evaluate(trained, cells, options.episodes, options.seed, options.epsilon):
-                rows.append(row)
-                progress.update()
-
-    from torchrl_l1.experiment.robustness import plot_robustness, summarize, table
-
-    output.mkdir(parents=True, exist_ok=True)
-    summary = summarize(rows)
-    print(table(summary))
-    RunDirectory(output).write_table(output / "evaluation.csv", rows)
-    RunDirectory(output).write_table(output / "summary.csv", summary)
-    plot_robustness(summary, output / "robustness.png", title=runs[0].recipe.recipe)
-    print(f"Table: {output / 'evaluation.csv'}, {output / 'summary.csv'}")
-    print(f"Plot: {output / 'robustness.png'}")
-    if options.filmstrip:
-        from torchrl_l1.experiment.filmstrip import write_filmstrip
-
-        worst = max(options.bias, key=abs)
-        write_filmstrip(runs[0], options.l1, worst, options.seed, output, options.epsilon)

@@ -1,0 +1,69 @@
+"""``torchrl-l1 evaluate``: from its options to tables, plots and films."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from tqdm import tqdm
+
+from torchrl_l1.experiment.evaluate import (
+    TrainedRun,
+    conditions,
+    evaluate,
+    group_setting,
+    load_run,
+)
+from torchrl_l1.experiment.filmstrip import write_filmstrip
+from torchrl_l1.experiment.robustness import plot_robustness, summarize, table
+from torchrl_l1.experiment.run_directory import RunDirectory
+from torchrl_l1.experiment.schema import METRPORecipe, WandbSettings
+
+
+def _check_one_study(runs: Sequence[TrainedRun]) -> None:
+    """Runs may differ in their seed and in nothing that matters."""
+
+    def settings(trained: TrainedRun) -> METRPORecipe:
+        return replace(trained.recipe, seed=0, run_dir="", resume=False, wandb=WandbSettings())
+
+    for trained in runs[1:]:
+        if settings(trained) != settings(runs[0]):
+            raise ValueError(
+                f"{runs[0].path} and {trained.path} differ in more than their seed; evaluate them "
+                "one at a time"
+            )
+
+
+def evaluate_command(options: argparse.Namespace) -> None:
+    """``torchrl-l1 evaluate``: table on the screen, CSV, PNG and, if asked, a filmstrip."""
+    cells = conditions(options.l1, options.noise, options.bias, options.gain, options.policy)
+    for name in options.l1:
+        group_setting("l1", name)
+    for name in options.noise:
+        group_setting("noise", name)
+    if options.episodes < 1:
+        raise ValueError(f"--episodes must be positive, got {options.episodes}")
+    runs = [load_run(path) for path in dict.fromkeys(map(Path, options.run_dir))]
+    _check_one_study(runs)
+    output = Path(options.output) if options.output else runs[0].path / "evaluation"
+    rows = []
+    total = len(runs) * len(cells)
+    with tqdm(total=total, desc="evaluate", unit="cell", disable=None) as progress:
+        for trained in runs:
+            for row in evaluate(trained, cells, options.episodes, options.seed, options.epsilon):
+                rows.append(row)
+                progress.update()
+
+    output.mkdir(parents=True, exist_ok=True)
+    summary = summarize(rows)
+    print(table(summary))
+    RunDirectory(output).write_table(output / "evaluation.csv", rows)
+    RunDirectory(output).write_table(output / "summary.csv", summary)
+    plot_robustness(summary, output / "robustness.png", title=runs[0].recipe.recipe)
+    print(f"Table: {output / 'evaluation.csv'}, {output / 'summary.csv'}")
+    print(f"Plot: {output / 'robustness.png'}")
+    if options.filmstrip:
+        worst = max(options.bias, key=abs)
+        write_filmstrip(runs[0], options.l1, worst, options.seed, output, options.epsilon)
