@@ -56,13 +56,14 @@ def run(repetitions: int) -> list[Row]:
         repetitions: interleaved measurements of each implementation.
 
     Returns:
-        One row per task: steps per second of the ``batched`` and the ``serial`` environments, and
-        the ``ratio`` of the two.
+        One row per task: steps per second of the ``batched`` environments with one thread and
+        (``batched_2``) two, of the ``serial`` ones, which know no threads, and both ratios.
     """
     rows: list[Row] = []
     for task in GYM_IDS:
         envs: dict[str, EnvBase] = {
             "batched": BatchedMujocoEnv(task, NUM_ENVS, seed=0, max_steps=10**9),
+            "batched_2": BatchedMujocoEnv(task, NUM_ENVS, seed=0, max_steps=10**9, threads=2),
             "serial": SerialEnv(NUM_ENVS, lambda task=task: _gym_env(task)),
         }
         recorded = [envs["batched"].action_spec.rand() for _ in range(STEPS)]
@@ -75,6 +76,7 @@ def run(repetitions: int) -> list[Row]:
         for name, values in seconds.items():
             row |= spread(name, [STEPS * NUM_ENVS / value for value in values])
         row |= ratio("ratio", seconds["serial"], seconds["batched"])
+        row |= ratio("ratio_2", seconds["serial"], seconds["batched_2"])
         rows.append(row)
         for env in envs.values():
             env.close()
@@ -86,15 +88,23 @@ def table(repetitions: int) -> Table:
     return Table(
         "env_stepping",
         "Environment stepping",
-        "Environment steps per second, median (range): the batched environment and "
-        "`SerialEnv(GymEnv)`, one thread.",
+        "Environment steps per second, median (range): the batched environment with one and with "
+        "two threads, and `SerialEnv(GymEnv)`, which knows no threads.",
         run(repetitions),
         {
             "task": "task",
             "num_envs": "environments",
-            "batched": "batched",
+            "batched": "batched, 1 thread",
+            "batched_2": "batched, 2 threads",
             "serial": "SerialEnv",
-            "ratio": "batched / SerialEnv",
+            "ratio": "1 thread / SerialEnv",
+            "ratio_2": "2 threads / SerialEnv",
         },
-        {"batched": ",.0f", "serial": ",.0f", "ratio": ".1f"},
+        {
+            "batched": ",.0f",
+            "batched_2": ",.0f",
+            "serial": ",.0f",
+            "ratio": ".1f",
+            "ratio_2": ".1f",
+        },
     )
