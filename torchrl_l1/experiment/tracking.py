@@ -32,7 +32,7 @@ class Tracker:
         check_mode(mode)
         if mode == "auto":
             # An explicit WANDB_MODE, as users set it on clusters, has the last word.
-            mode = os.environ.get("WANDB_MODE") or ("online" if wandb.api.api_key else "offline")
+            mode = os.environ.get("WANDB_MODE") or ("online" if _logged_in() else "offline")
         self._run = wandb.init(
             mode=mode,  # type: ignore[arg-type]
             project=project,
@@ -53,6 +53,14 @@ class Tracker:
     def close(self) -> None:
         """Flush and close."""
         self._run.finish()
+
+
+def _logged_in() -> bool:
+    try:
+        return bool(wandb.login(prompt=False))
+    except wandb.errors.Error:
+        # A key without a network that would accept it: nothing is lost offline.
+        return False
 
 
 def check_mode(mode: str) -> None:
