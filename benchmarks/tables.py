@@ -37,7 +37,7 @@ class Table:
     def markdown(self) -> str:
         """The table with its heading, each cell as median and range."""
         lines = [
-            f"### {self.title}",
+            f"## {self.title}",
             "",
             self.caption,
             "",
