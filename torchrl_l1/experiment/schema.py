@@ -69,8 +69,6 @@ class RunSettings:
         threads: CPU threads of torch.
         device: ``cpu``, ``cuda`` or ``auto`` (CUDA where there is one).
         horizon: steps per real episode; the task's own if null.
-        published_episodes: real episodes per iteration of the published runs, for
-            ``preset=paper``.
         published_horizon: imagined horizon of the published runs, for ``preset=paper``.
         l1: see :class:`L1Settings`.
         perturbation: noise and disturbances of the real environment.
@@ -86,7 +84,6 @@ class RunSettings:
     device: str = "cpu"
     horizon: int | None = None
     published_horizon: int = 1000
-    published_episodes: int = 6
     l1: L1Settings = field(default_factory=L1Settings)
     perturbation: Perturbation = field(default_factory=Perturbation)
     wandb: WandbSettings = field(default_factory=WandbSettings)
