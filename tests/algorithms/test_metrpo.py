@@ -61,6 +61,16 @@ def test_buffer_holds_the_policy_action_and_the_executed_one() -> None:
     assert 0 < data["validation"].float().mean() < 0.3
 
 
+def test_actions_can_be_left_unclipped_without_l1_only() -> None:
+    algorithm = make(l1=None, clip_actions=False, policy=PolicyConfig(hidden=[8], std=4.0))
+    list(algorithm.iterate())
+    learned = algorithm.buffer[:][75:]
+    assert learned["action"].abs().max() > 3
+    assert torch.equal(learned["action"], learned["executed"])
+    with pytest.raises(ValueError, match="l1=off"):
+        make(clip_actions=False)
+
+
 def test_noise_on_the_actuator_is_not_in_the_data() -> None:
     algorithm = METRPO(
         "inverted_pendulum", tiny(), perturbation=Perturbation(actuator_bias=2.0), horizon=25
@@ -101,7 +111,7 @@ def test_label_decides_what_the_model_is_fitted_to() -> None:
 def test_imagined_trajectories_start_where_the_configuration_says() -> None:
     algorithm = make(imagined_from_data=0.25)
     algorithm.store(algorithm.collection.random(0))
-    starts = algorithm.imagined_starts(40)
+    starts = algorithm.improvement.starts(40, algorithm.buffer)
     stored = algorithm.buffer[:]["observation"]
     from_data = (starts[:, None] == stored).all(-1).any(-1)
     assert from_data.tolist() == [False] * 30 + [True] * 10

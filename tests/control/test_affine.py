@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import torch
 
-from torchrl_l1.control import ActionJacobian, Affinization, affinize, reaffinize, switching_law
+from torchrl_l1.control import ActionJacobian, affinize, switching_law
 
 
 def quadratic(observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
@@ -33,52 +33,30 @@ def test_switching_law_measures_the_error_of_the_affine_model():
     x, u_bar, u = point(6)
     # The remainder of a quadratic is exact: |u - u_bar|^2 in each of the three coordinates.
     expected = 3**0.5 * (u - u_bar).square().sum(-1, keepdim=True)
-    affinization = affinize(MODEL, x, u_bar)
-    switch, error = switching_law(affinization, u, quadratic(x, u), expected.median().item())
+    switch, error = switching_law(MODEL, x, u_bar, u, expected.median().item())
     torch.testing.assert_close(error, expected)
     assert torch.equal(switch, error > expected.median().item())
     assert 0 < switch.sum() < 6
+    # The same from the affine model itself.
+    tangent = affinize(MODEL, x, u_bar).change(u)
+    gap = torch.linalg.vector_norm(tangent - quadratic(x, u), dim=-1, keepdim=True)
+    torch.testing.assert_close(error, gap)
 
 
 def test_switching_is_strict_and_ignores_what_is_not_a_number():
-    affinization = Affinization(torch.zeros(2, 1), torch.zeros(2, 3), torch.zeros(2, 3, 1))
-    value = torch.tensor([[3.0, 4.0, 0.0], [torch.nan, 0.0, 0.0]])
-    assert switching_law(affinization, torch.zeros(2, 1), value, 5.0)[0].tolist() == [[0], [0]]
-    assert switching_law(affinization, torch.zeros(2, 1), value, 4.9)[0].tolist() == [[1], [0]]
+    def model(observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        # Flat at zero action, and 5 away from that at an action of one.
+        size = action.square()
+        return observation * size + torch.cat([3 * size, 4 * size, 0 * size], dim=-1)
+
+    x = torch.tensor([[0.0, 0.0, 0.0], [torch.nan, 0.0, 0.0]])
+    u_bar, u = torch.zeros(2, 1), torch.ones(2, 1)
+    assert switching_law(ActionJacobian(model), x, u_bar, u, 5.0)[0].tolist() == [[0], [0]]
+    assert switching_law(ActionJacobian(model), x, u_bar, u, 4.9)[0].tolist() == [[1], [0]]
 
 
-def test_reaffinize_moves_the_chosen_environments_only():
-    for mask in ([0, 0, 0, 0], [1, 0, 0, 1], [1, 1, 1, 1]):
-        x, u_bar, u = point(4)
-        switch = torch.tensor(mask, dtype=torch.bool).unsqueeze(-1)
-        old = affinize(MODEL, x, u_bar)
-        kept = [entry.clone() for entry in old]
-        moved = reaffinize(MODEL, x, old, u, switch)
-        expected = affinize(MODEL, x, torch.where(switch, u, u_bar))
-        for value, want in zip(moved, expected, strict=True):
-            torch.testing.assert_close(value, want)
-        for value, want in zip(old, kept, strict=True):
-            torch.testing.assert_close(value, want, atol=0, rtol=0)
-
-
-def test_reaffinize_without_batch_dimensions():
+def test_switching_law_without_batch_dimensions():
     x, u_bar, u = point()
-    old = affinize(MODEL, x, u_bar)
-    assert reaffinize(MODEL, x, old, u, torch.tensor([False])) is old
-    moved = reaffinize(MODEL, x, old, u, torch.tensor([True]))
-    torch.testing.assert_close(moved.jacobian, affinize(MODEL, x, u).jacobian)
-
-
-def test_only_what_switched_is_evaluated():
-    rows = []
-
-    def counting(observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        rows.append(observation.shape[0])
-        return quadratic(observation, action)
-
-    x, u_bar, u = point(5)
-    model = ActionJacobian(counting)
-    old = affinize(model, x, u_bar)
-    rows.clear()
-    reaffinize(model, x, old, u, torch.tensor([[0], [1], [0], [0], [1]], dtype=torch.bool))
-    assert rows == [2]
+    switch, error = switching_law(MODEL, x, u_bar, u, 0.0)
+    assert switch.shape == error.shape == (1,)
+    assert switch.all()

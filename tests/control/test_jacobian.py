@@ -92,6 +92,26 @@ def test_analytic_path_agrees_with_forward_mode_of_the_same_model():
         torch.testing.assert_close(a, b)
 
 
+def test_taylor_remainder_is_what_the_tangent_misses(net):
+    """By forward mode, by a model's Jacobian, and by a model's own remainder."""
+    torch.manual_seed(0)
+    ensemble = EnsembleDynamics(N, M, members=3, hidden=(32, 32), activation="tanh").double()
+    observation, u_bar = data(50)
+    ensemble.fit_statistics(3 + 2 * observation, 0.3 * u_bar, 0.1 * observation)
+
+    class JacobianOnly:
+        mean_change = staticmethod(ensemble.mean_change)
+        value_and_jacobian = staticmethod(ensemble.value_and_jacobian)
+
+    action = u_bar + torch.randn_like(u_bar)
+    for dynamics in (net, ensemble, JacobianOnly()):
+        model = ActionJacobian(dynamics)
+        value, jacobian = model.value_and_jacobian(observation, u_bar)
+        tangent = value + (jacobian @ (action - u_bar).unsqueeze(-1)).squeeze(-1)
+        expected = model.value(observation, action) - tangent
+        torch.testing.assert_close(model.taylor_remainder(observation, u_bar, action), expected)
+
+
 def test_model_with_mean_change_only_is_differentiated(net):
     class Model:
         def mean_change(self, observation, action):

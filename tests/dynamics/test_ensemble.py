@@ -62,6 +62,13 @@ def test_jacobian_agrees_with_autograd_through_the_normalisers(
             lambda action, i=i: model.mean_change(x[i : i + 1], action[None])[0], u[i]
         )
         torch.testing.assert_close(jacobian[i], expected, rtol=1e-8, atol=1e-10)
+    other = u + torch.randn(batch, m).double()
+    tangent = value + (jacobian @ (other - u).unsqueeze(-1)).squeeze(-1)
+    remainder = model.taylor_remainder(x, u, other)
+    scale = value.abs().max().item()
+    torch.testing.assert_close(
+        remainder, model.mean_change(x, other) - tangent, rtol=1e-8, atol=1e-12 * scale
+    )
 
 
 def test_jacobian_agrees_with_finite_differences() -> None:
@@ -85,6 +92,7 @@ def test_any_batch_shape() -> None:
         value, jacobian = model.value_and_jacobian(x, u)
         assert value.shape == (*shape, 3)
         assert jacobian.shape == (*shape, 3, 2)
+        assert model.taylor_remainder(x, u, u).shape == (*shape, 3)
         assert model.member_changes(x, u).shape == (2, *shape, 3)
 
 

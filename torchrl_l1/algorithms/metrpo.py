@@ -20,7 +20,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
-from torchrl_l1.algorithms.advantages import imagined_advantages
 from torchrl_l1.algorithms.collection import (
     Collection,
     Perturbation,
@@ -30,14 +29,14 @@ from torchrl_l1.algorithms.collection import (
 )
 from torchrl_l1.algorithms.device import resolve_device
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig
-from torchrl_l1.algorithms.metrpo_metrics import PolicyStep, fit_metrics, policy_metrics
-from torchrl_l1.algorithms.policy import GaussianPolicy, clipped, make_actor
+from torchrl_l1.algorithms.metrpo_metrics import fit_metrics, policy_metrics
+from torchrl_l1.algorithms.policy import GaussianPolicy, acting
+from torchrl_l1.algorithms.policy_improvement import PolicyImprovement
 from torchrl_l1.algorithms.seeding import seed_streams
 from torchrl_l1.control import L1Config
 from torchrl_l1.control.compilation import CompileMode
-from torchrl_l1.dynamics import EnsembleDynamics, fit_ensemble, imagine
-from torchrl_l1.envs import StartStates, get_task
-from torchrl_l1.objectives import LinearFeatureBaseline, trpo_step
+from torchrl_l1.dynamics import fit_ensemble, make_dynamics
+from torchrl_l1.envs import get_task
 
 
 @dataclass
@@ -65,6 +64,9 @@ class METRPO:
         compile_l1: whether to compile the controller's step, see
             :class:`~torchrl_l1.control.L1Transform`.
         on_phase: called with a word on what is going on, for progress bars.
+
+    Raises:
+        ValueError: if L1 is on and ``clip_actions`` is off.
     """
 
     def __init__(
@@ -79,40 +81,30 @@ class METRPO:
         compile_l1: CompileMode = False,
         on_phase: Callable[[str], None] | None = None,
     ) -> None:
+        if l1 is not None and not config.clip_actions:
+            raise ValueError(
+                "clip_actions=false is for runs without L1: the adaptive controller always keeps "
+                "the action within its bounds (use l1=off)"
+            )
         self.config, self.seed = config, seed
         self.device = resolve_device(device)
         self.on_phase = on_phase or (lambda phase: None)
         self.task = get_task(task)
         n, m = self.task.observation_dim, self.task.action_dim
         seed_streams(seed, "initialisation")
-        model, policy = config.model, config.policy
-        self.dynamics = EnsembleDynamics(
-            n,
-            m,
-            model.members,
-            model.hidden,
-            model.activation,  # type: ignore[arg-type]
-            model.std_floor,
-            model.box_margin,
-        ).to(self.device)
-        self.policy = GaussianPolicy(n, m, policy.hidden, policy.std).to(self.device)
-        self.actor = make_actor(self.policy)
-        self.baseline = LinearFeatureBaseline(n).to(self.device)
+        self.dynamics = make_dynamics(n, m, **vars(config.model)).to(self.device)
+        self.policy = GaussianPolicy(n, m, config.policy.hidden, config.policy.std).to(self.device)
+        self.improvement = PolicyImprovement(self.task, self.dynamics, self.policy, config)
         self.optimizer = torch.optim.Adam(
             self.dynamics.parameters(), lr=config.fit.learning_rate, fused=True
         )
-        self.action_low = torch.full((m,), self.task.action_low, device=self.device)
-        self.action_high = torch.full((m,), self.task.action_high, device=self.device)
         on_cpu = self.device.type == "cpu"
         self.acting_policy = self.policy if on_cpu else deepcopy(self.policy).cpu()
         self.acting_dynamics = self.dynamics if on_cpu else deepcopy(self.dynamics).cpu()
-        self.start_states = StartStates(self.task)
         real = partial(
             Collection,
             self.task,
-            policy=clipped(
-                make_actor(self.acting_policy), self.action_low.cpu(), self.action_high.cpu()
-            ),
+            policy=acting(self.acting_policy, self.task, config.clip_actions),
             dynamics=self.acting_dynamics,
             l1=l1,
             perturbation=perturbation or Perturbation(),
@@ -158,7 +150,7 @@ class METRPO:
             steps = []
             for step in range(config.trpo_iterations):
                 self.on_phase(f"TRPO {step + 1}/{config.trpo_iterations}")
-                steps.append(self.improve_policy())
+                steps.append(self.improvement.step(self.buffer))
             clock.append(perf_counter())
 
             self.on_phase("collecting")
@@ -209,64 +201,13 @@ class METRPO:
             "return_deterministic": mean_action.mean().item(),
         }
 
-    def improve_policy(self) -> PolicyStep:
-        """One TRPO step on fresh imagined trajectories; the baseline is refitted after it."""
-        config = self.config
-        trajectories = imagine(
-            self.dynamics,
-            self.policy.sample,
-            self.task.imagined_reward,
-            self.imagined_starts(config.imagined_steps // config.imagined_horizon),
-            config.imagined_horizon,
-            self.action_low,
-            self.action_high,
-        )
-        observation, step = trajectories["observation"], trajectories["step"]
-        if config.bootstrap:
-            step = torch.zeros_like(step)
-        with torch.no_grad():
-            value = self.baseline(observation, step)
-            last_value = torch.zeros_like(value[:, :1])
-            if config.bootstrap:
-                last = trajectories["next", "observation"][:, -1:]
-                last_value = self.baseline(last, step[:, -1:])
-        advantage, target = imagined_advantages(
-            trajectories, value, last_value, config.discount, config.gae_lambda, config.box_exit
-        )
-        valid = trajectories["valid"].squeeze(-1)
-        samples = TensorDict(
-            {
-                "observation": observation[valid],
-                "action": trajectories["action"][valid],
-                "advantage": _standardize(advantage[valid]),
-            },
-            batch_size=[int(valid.sum())],
-        )
-        report = trpo_step(self.actor, samples, config.trpo)
-        self.baseline.fit(observation[valid], step[valid], target[valid])
-        rewards = trajectories["next", "reward"] * trajectories["valid"]
-        return PolicyStep(
-            report,
-            imagined_return=rewards.sum(1).mean().item(),
-            left_box=trajectories["next", "terminated"].any(1).float().mean().item(),
-        )
-
-    def imagined_starts(self, count: int) -> torch.Tensor:
-        """First observations of imagined trajectories ``(count, n)``."""
-        from_data = round(self.config.imagined_from_data * count)
-        starts = [self.start_states(count - from_data)]
-        if from_data:
-            index = torch.randint(len(self.buffer), (from_data,))
-            starts.append(self.buffer[index]["observation"])
-        return torch.cat(starts).to(self.device)
-
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue, as plain tensors and numbers."""
         return {
             "iteration": self.iteration,
             "dynamics": self.dynamics.state_dict(),
             "policy": self.policy.state_dict(),
-            "baseline": self.baseline.state_dict(),
+            "improvement": self.improvement.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "buffer": self.buffer[:].to_dict() if len(self.buffer) else {},
         }
@@ -276,12 +217,8 @@ class METRPO:
         self.iteration = state["iteration"]
         self.dynamics.load_state_dict(state["dynamics"])
         self.policy.load_state_dict(state["policy"])
-        self.baseline.load_state_dict(state["baseline"])
+        self.improvement.load_state_dict(state["improvement"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.buffer.empty()
         if state["buffer"]:
             self.buffer.extend(TensorDict(state["buffer"]).auto_batch_size_(1))
-
-
-def _standardize(advantage: torch.Tensor) -> torch.Tensor:
-    return (advantage - advantage.mean()) / (advantage.std() + 1e-8)

@@ -4,19 +4,41 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from torchrl_l1.dynamics import FitConfig
+from torchrl_l1.dynamics import MODEL_FORMS, FitConfig
 from torchrl_l1.objectives import TRPOConfig
 
 
 @dataclass
 class ModelConfig:
-    """Size of the ensemble, see :class:`~torchrl_l1.dynamics.EnsembleDynamics`."""
+    """The ensemble, see :func:`~torchrl_l1.dynamics.make_dynamics`.
 
+    Attributes:
+        form: ``nonlinear``, or ``affine`` in the action.
+        members: number of networks.
+        hidden: widths of a nonlinear network's hidden layers; for the control-affine form they
+            are scaled to the same number of parameters.
+        activation: ``relu``, ``tanh`` or ``silu``.
+        std_floor: smallest standard deviation of the normalisers, raw units.
+        box_margin: widening of the box around the data, see
+            :class:`~torchrl_l1.dynamics.DataBox`.
+    """
+
+    form: str = "nonlinear"
     members: int = 5
     hidden: list[int] = field(default_factory=lambda: [256, 256])
     activation: str = "relu"
     std_floor: float = 1e-4
     box_margin: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuse a form that does not exist.
+
+        Raises:
+            ValueError: naming the setting.
+        """
+        if self.form not in MODEL_FORMS:
+            allowed = " or ".join(map(repr, MODEL_FORMS))
+            raise ValueError(f"model.form must be {allowed}, got {self.form!r}")
 
 
 @dataclass
@@ -65,6 +87,8 @@ class METRPOConfig:
             last steps.
         discount: gamma.
         gae_lambda: lambda of the generalized advantage estimate.
+        clip_actions: whether the policy's actions are clipped to their bounds before they act and
+            are stored. The authors' runs without L1 probably did not; with L1 it is refused.
         label: action that the model is fitted to: ``nominal`` is the policy's (the paper's
             choice), ``executed`` what L1 sends to the actuators.
         model: see :class:`ModelConfig`.
@@ -85,6 +109,7 @@ class METRPOConfig:
     bootstrap: bool = False
     discount: float = 0.99
     gae_lambda: float = 0.95
+    clip_actions: bool = True
     label: str = "nominal"
     model: ModelConfig = field(default_factory=ModelConfig)
     policy: PolicyConfig = field(default_factory=PolicyConfig)

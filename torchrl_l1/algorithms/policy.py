@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from torchrl_l1.dynamics import Normalizer
+from torchrl_l1.envs import Task
 
 
 class GaussianPolicy(nn.Module):
@@ -86,3 +87,18 @@ def clipped(actor: ProbabilisticActor, low: Tensor, high: Tensor) -> TensorDictS
         lambda action: action.clamp(low, high), in_keys=["action"], out_keys=["action"]
     )
     return TensorDictSequential(actor, clip)
+
+
+def acting(policy: GaussianPolicy, task: Task, clip: bool = True) -> TensorDictModuleBase:
+    """What acts on the real system: the policy's actor, its actions clipped to the task's bounds.
+
+    Args:
+        policy: shared, not copied.
+        task: for the bounds.
+        clip: whether to clip.
+    """
+    actor = make_actor(policy)
+    if not clip:
+        return actor
+    low, high = (torch.full((task.action_dim,), b) for b in (task.action_low, task.action_high))
+    return clipped(actor, low, high)

@@ -8,7 +8,6 @@ from torchrl_l1.control.affine import (
     AffineModel,
     Affinization,
     affinize,
-    reaffinize,
     switching_law,
 )
 from torchrl_l1.control.affinizer import Affinizer
@@ -33,7 +32,6 @@ __all__ = [
     "affinize",
     "augment",
     "init",
-    "reaffinize",
     "solve_matched",
     "step",
     "switching_law",

@@ -53,55 +53,31 @@ def affinize(model: ActionJacobian, observation: Tensor, u_bar: Tensor) -> Affin
 
 
 def switching_law(
-    affinization: Affinization, action: Tensor, value: Tensor, epsilon: float
+    model: ActionJacobian,
+    observation: Tensor,
+    u_bar: Tensor,
+    action: Tensor,
+    epsilon: float,
 ) -> tuple[Tensor, Tensor]:
-    r"""Whether the affine model has become too inaccurate at ``action``.
+    r"""Whether the affine model around ``u_bar`` is too inaccurate at ``action``.
 
     arXiv 2403.14860, switching condition in section 3.2:
     :math:`\|\hat f^a(x, u; \bar u) - \hat f(x, u)\| > \epsilon`, Euclidean norm in raw state
     units. An error that is not a number does not switch.
 
+    The affine model is compared at one input only, which takes one directional derivative; the
+    Jacobian is evaluated once per step, at the operating point that this law selects.
+
     Args:
-        affinization: the affine model.
+        model: the learned dynamics.
+        observation: ``(..., n)``, raw units.
+        u_bar: the operating input ``(..., m)``.
         action: the tested input ``(..., m)``.
-        value: the model's own prediction at ``action`` ``(..., n)``.
         epsilon: tolerance, state units.
 
     Returns:
         switch ``(..., 1)`` (bool) and the error ``(..., 1)``.
     """
-    error = torch.linalg.vector_norm(affinization.change(action) - value, dim=-1, keepdim=True)
+    remainder = model.taylor_remainder(observation, u_bar, action)
+    error = torch.linalg.vector_norm(remainder, dim=-1, keepdim=True)
     return error > epsilon, error
-
-
-def reaffinize(
-    model: ActionJacobian,
-    observation: Tensor,
-    affinization: Affinization,
-    u_rl: Tensor,
-    switch: Tensor,
-) -> Affinization:
-    """Move the operating point to ``u_rl`` where ``switch`` is set.
-
-    The Jacobian is the dearest part of a step. On the CPU it is evaluated only for the
-    environments that switched; in compiled code and on devices where looking at ``switch``
-    would stall the queue it is evaluated for all and selected.
-    """
-    if torch.compiler.is_compiling() or observation.device.type != "cpu":
-        moved = affinize(model, observation, u_rl)
-        return Affinization(
-            u_bar=torch.where(switch, moved.u_bar, affinization.u_bar),
-            value=torch.where(switch, moved.value, affinization.value),
-            jacobian=torch.where(switch.unsqueeze(-1), moved.jacobian, affinization.jacobian),
-        )
-    rows = switch.squeeze(-1)
-    if not rows.any():
-        return affinization
-    if rows.all():
-        return affinize(model, observation, u_rl)
-    value, jacobian = model.value_and_jacobian(observation[rows], u_rl[rows])
-    return Affinization(
-        u_bar=torch.where(switch, u_rl, affinization.u_bar),
-        value=affinization.value.index_put((rows,), value),
-        jacobian=affinization.jacobian.index_put((rows,), jacobian),
-    )

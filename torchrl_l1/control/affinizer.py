@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
-from torchrl_l1.control.affine import affinize, reaffinize, switching_law
+from torchrl_l1.control.affine import affinize, switching_law
 from torchrl_l1.control.faces import (
     Dynamics,
     as_action_jacobian,
@@ -111,11 +111,10 @@ class Affinizer(TensorDictModuleBase):
             affinization = affinize(self.model, observation, action)
         else:
             u_bar, started = (self._memory(tensordict, name) for name in _STATE)
-            current = affinize(self.model, observation, torch.where(started, u_bar, action))
-            value = self.model.value(observation, action)
-            switch, error = switching_law(current, action, value, self.epsilon)
+            u_bar = torch.where(started, u_bar, action)
+            switch, error = switching_law(self.model, observation, u_bar, action, self.epsilon)
             switch = switch & started
-            affinization = reaffinize(self.model, observation, current, action, switch)
+            affinization = affinize(self.model, observation, torch.where(switch, action, u_bar))
             tensordict.set((self.key, "switch"), switch)
             tensordict.set((self.key, "error"), torch.where(started, error, 0.0))
             following = TensorDict(

@@ -13,8 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_l1.control import specs
-from torchrl_l1.control.affine import Affinization, reaffinize
-from torchrl_l1.control.augmentation import Assessment, assess, augment, conclude
+from torchrl_l1.control.augmentation import augment
 from torchrl_l1.control.compilation import CompileMode, compiled
 from torchrl_l1.control.jacobian import ActionJacobian, ChangeFunction, DynamicsModel, Predicts
 from torchrl_l1.control.law import L1Config, L1Diagnostics, L1State
@@ -46,36 +45,10 @@ def as_action_jacobian(
 def make_step(config: L1Config, model: ActionJacobian, mode: CompileMode) -> StepFunction:
     """The step of L1 as a function of state, observation and action, compiled or not."""
 
-    def whole(state: L1State, observation: Tensor, u_rl: Tensor) -> Step:
+    def step(state: L1State, observation: Tensor, u_rl: Tensor) -> Step:
         return augment(config, model, state, observation, u_rl)
 
-    if mode is False:
-        return whole
-
-    def first(state: L1State, observation: Tensor, u_rl: Tensor) -> Assessment:
-        return assess(config, model, state, observation, u_rl)
-
-    def last(
-        state: L1State, observation: Tensor, assessment: Assessment, selected: Affinization
-    ) -> Step:
-        return conclude(config, state, observation, assessment, selected)
-
-    # One graph must evaluate the second Jacobian for every environment. On the CPU two graphs
-    # with a look at the switches between them are faster.
-    whole_graph, first_graph, last_graph = (
-        compiled(cast(FunctionType, function), mode) for function in (whole, first, last)
-    )
-
-    def step(state: L1State, observation: Tensor, u_rl: Tensor) -> Step:
-        if observation.device.type != "cpu":
-            return whole_graph(state, observation, u_rl)
-        assessment = first_graph(state, observation, u_rl)
-        selected = reaffinize(
-            model, observation, assessment.current, assessment.u_rl, assessment.switch
-        )
-        return last_graph(state, observation, assessment, selected)
-
-    return step
+    return compiled(cast(FunctionType, step), mode)
 
 
 def advance(

@@ -22,7 +22,9 @@ class DynamicsModel(Protocol):
 
     A model may also have ``value_and_jacobian(observation, action)``, which returns the same
     change ``(..., n)`` together with its derivative with respect to the action ``(..., n, m)``
-    in raw units; it is then used in place of automatic differentiation.
+    in raw units; it is then used in place of automatic differentiation. So is
+    ``taylor_remainder(observation, u_bar, action)``, which returns what the tangent at ``u_bar``
+    misses of the change at ``action`` ``(..., n)``.
     """
 
     def mean_change(self, observation: Tensor, action: Tensor) -> Tensor:
@@ -156,6 +158,25 @@ class ActionJacobian:
         return value, jacobian
 
     __call__ = value_and_jacobian
+
+    def taylor_remainder(self, observation: Tensor, u_bar: Tensor, action: Tensor) -> Tensor:
+        r"""What the tangent at ``u_bar`` misses of the change at ``action``: ``(..., n)``.
+
+        This is :math:`\hat f(x, u) - \hat f(x, \bar u) - J(x, \bar u)(u - \bar u)`. It needs one
+        product with the Jacobian and not the Jacobian.
+        """
+        analytic = getattr(self.dynamics, "taylor_remainder", None)
+        if callable(analytic):
+            return analytic(observation, u_bar, action)
+        step = action - u_bar
+        if self.analytic:
+            value, jacobian = self.value_and_jacobian(observation, u_bar)
+            slope = (jacobian @ step.unsqueeze(-1)).squeeze(-1)
+        else:
+            value, slope, *_ = torch.func.jvp(
+                lambda u: self.value(observation, u), (u_bar,), (step,)
+            )
+        return self.value(observation, action) - value - slope
 
     def _forward_mode(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         def push_forward(tangent: Tensor) -> tuple[Tensor, ...]:

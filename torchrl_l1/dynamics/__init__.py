@@ -1,6 +1,8 @@
 """Learned models of the dynamics: batched ensembles, their training and their use."""
 
+from torchrl_l1.dynamics.control_affine import ControlAffineDynamics
 from torchrl_l1.dynamics.ensemble import EnsembleMLP
+from torchrl_l1.dynamics.factory import MODEL_FORMS, make_dynamics, matched_hidden
 from torchrl_l1.dynamics.fit import FitConfig, FitReport, evaluate_members, fit_ensemble
 from torchrl_l1.dynamics.heads import DeterministicHead, Head
 from torchrl_l1.dynamics.imagination import imagine
@@ -10,6 +12,8 @@ from torchrl_l1.dynamics.model_env import EnsembleModelEnv, EnsembleWorldModel
 from torchrl_l1.dynamics.normalizer import DataBox, Normalizer
 
 __all__ = [
+    "MODEL_FORMS",
+    "ControlAffineDynamics",
     "DataBox",
     "DeterministicHead",
     "EnsembleDynamics",
@@ -24,4 +28,6 @@ __all__ = [
     "evaluate_members",
     "fit_ensemble",
     "imagine",
+    "make_dynamics",
+    "matched_hidden",
 ]

@@ -78,7 +78,7 @@ class EnsembleDynamicsLoss(LossModule):
         model = self.dynamics
         inputs = model.normalize_inputs(observation, action)
         target = model.change_normalizer.normalize(next_observation - observation)
-        per_member = model.head.loss(model.network(inputs), target).mean(-1)
+        per_member = model.head.loss(model.raw(inputs), target).mean(-1)
         return TensorDict(
             {"loss_dynamics": per_member.sum(), "member_loss": per_member.detach()}, batch_size=[]
         )

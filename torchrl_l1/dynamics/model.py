@@ -54,17 +54,17 @@ class EnsembleDynamics(nn.Module):
         self.observation_dim = observation_dim
         self.action_dim = action_dim
         self.head: Head = DeterministicHead() if head is None else head
-        self.network = EnsembleMLP(
-            observation_dim + action_dim,
-            self.head.out_features(observation_dim),
-            hidden,
-            members,
-            activation,
-        )
+        self.network = self._make_network(hidden, members, activation)
         self.observation_normalizer = Normalizer(observation_dim, std_floor)
         self.action_normalizer = Normalizer(action_dim, std_floor)
         self.change_normalizer = Normalizer(observation_dim, std_floor)
         self.box = DataBox(observation_dim, box_margin)
+
+    def _make_network(
+        self, hidden: Sequence[int], members: int, activation: ActivationName
+    ) -> EnsembleMLP:
+        n, m = self.observation_dim, self.action_dim
+        return EnsembleMLP(n + m, self.head.out_features(n), hidden, members, activation)
 
     @property
     def members(self) -> int:
@@ -93,17 +93,32 @@ class EnsembleDynamics(nn.Module):
             dim=-1,
         )
 
+    def raw(self, inputs: Tensor) -> Tensor:
+        """What the head makes sense of, for all members, from :meth:`normalize_inputs`.
+
+        Args:
+            inputs: shared by the members ``(B, n + m)``, or their own ``(E, B, n + m)``.
+
+        Returns:
+            ``(E, B, out)``, normalised units.
+        """
+        return self.network(inputs)
+
+    def raw_member(self, inputs: Tensor, member: int) -> Tensor:
+        """As :meth:`raw` for one member: ``(B, n + m)`` to ``(B, out)``."""
+        return self.network.forward_member(inputs, member)
+
     def member_changes(self, observation: Tensor, action: Tensor) -> Tensor:
         """Predicted change of every member: ``(..., n)`` and ``(..., m)`` to ``(E, ..., n)``."""
         inputs = self.normalize_inputs(observation, action)
-        raw = self.network(inputs.reshape(-1, inputs.shape[-1]))[..., : self.observation_dim]
+        raw = self.raw(inputs.reshape(-1, inputs.shape[-1]))[..., : self.observation_dim]
         changes = self.change_normalizer.denormalize(raw)
         return changes.reshape(self.members, *observation.shape)
 
     def member_change(self, observation: Tensor, action: Tensor, member: int) -> Tensor:
         """Predicted change of one member: ``(B, n)`` and ``(B, m)`` to ``(B, n)``."""
         inputs = self.normalize_inputs(observation, action)
-        raw = self.network.forward_member(inputs, member)[..., : self.observation_dim]
+        raw = self.raw_member(inputs, member)[..., : self.observation_dim]
         return self.change_normalizer.denormalize(raw)
 
     def mean_change(self, observation: Tensor, action: Tensor) -> Tensor:
@@ -134,3 +149,25 @@ class EnsembleDynamics(nn.Module):
             change.reshape(observation.shape),
             (jacobian * scale).reshape(*observation.shape, m),
         )
+
+    def taylor_remainder(self, observation: Tensor, u_bar: Tensor, action: Tensor) -> Tensor:
+        r"""What the tangent in the action at ``u_bar`` misses of the mean change at ``action``.
+
+        Args:
+            observation: ``(..., n)``, raw units.
+            u_bar: where the model is expanded ``(..., m)``.
+            action: where the expansion is compared with the model ``(..., m)``.
+
+        Returns:
+            :math:`\hat f(x, u) - \hat f(x, \bar u) - J(x, \bar u) (u - \bar u)`, state units
+            ``(..., n)``.
+        """
+        inputs = self.normalize_inputs(observation, u_bar)
+        step = (action - u_bar) / self.action_normalizer.std
+        step = torch.cat([torch.zeros_like(observation), step], dim=-1)
+        width = inputs.shape[-1]
+        remainder = self.network.taylor_remainder(
+            inputs.reshape(-1, width), step.reshape(-1, width)
+        )
+        mean = remainder.mean(0)[:, : self.observation_dim] * self.change_normalizer.std
+        return mean.reshape(observation.shape)

@@ -1,0 +1,105 @@
+"""Policy improvement of METRPO: TRPO on trajectories imagined in the ensemble."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.data import ReplayBuffer
+
+from torchrl_l1.algorithms.advantages import imagined_advantages
+from torchrl_l1.algorithms.metrpo_config import METRPOConfig
+from torchrl_l1.algorithms.metrpo_metrics import PolicyStep
+from torchrl_l1.algorithms.policy import GaussianPolicy, make_actor
+from torchrl_l1.dynamics import EnsembleDynamics, imagine
+from torchrl_l1.envs import StartStates, Task
+from torchrl_l1.objectives import LinearFeatureBaseline, trpo_step
+
+
+class PolicyImprovement:
+    """TRPO steps of a policy in a learned model (arXiv 1802.10592).
+
+    Args:
+        task: rewards, start states and action bounds.
+        dynamics: the model.
+        policy: changed in place, on the model's device.
+        config: settings.
+    """
+
+    def __init__(
+        self, task: Task, dynamics: EnsembleDynamics, policy: GaussianPolicy, config: METRPOConfig
+    ) -> None:
+        self.task, self.dynamics, self.policy, self.config = task, dynamics, policy, config
+        self.device = next(policy.parameters()).device
+        self.actor = make_actor(policy)
+        self.baseline = LinearFeatureBaseline(task.observation_dim).to(self.device)
+        self.start_states = StartStates(task)
+        self.action_low, self.action_high = (
+            torch.full((task.action_dim,), bound, device=self.device)
+            for bound in (task.action_low, task.action_high)
+        )
+
+    def step(self, buffer: ReplayBuffer) -> PolicyStep:
+        """One TRPO step on fresh imagined trajectories; the baseline is refitted after it."""
+        config = self.config
+        trajectories = imagine(
+            self.dynamics,
+            self.policy.sample,
+            self.task.imagined_reward,
+            self.starts(config.imagined_steps // config.imagined_horizon, buffer),
+            config.imagined_horizon,
+            self.action_low,
+            self.action_high,
+        )
+        observation, step = trajectories["observation"], trajectories["step"]
+        if config.bootstrap:
+            step = torch.zeros_like(step)
+        with torch.no_grad():
+            value = self.baseline(observation, step)
+            last_value = torch.zeros_like(value[:, :1])
+            if config.bootstrap:
+                last = trajectories["next", "observation"][:, -1:]
+                last_value = self.baseline(last, step[:, -1:])
+        advantage, target = imagined_advantages(
+            trajectories, value, last_value, config.discount, config.gae_lambda, config.box_exit
+        )
+        valid = trajectories["valid"].squeeze(-1)
+        samples = TensorDict(
+            {
+                "observation": observation[valid],
+                "action": trajectories["action"][valid],
+                "advantage": _standardize(advantage[valid]),
+            },
+            batch_size=[int(valid.sum())],
+        )
+        report = trpo_step(self.actor, samples, config.trpo)
+        self.baseline.fit(observation[valid], step[valid], target[valid])
+        rewards = trajectories["next", "reward"] * trajectories["valid"]
+        return PolicyStep(
+            report,
+            imagined_return=rewards.sum(1).mean().item(),
+            left_box=trajectories["next", "terminated"].any(1).float().mean().item(),
+        )
+
+    def starts(self, count: int, buffer: ReplayBuffer) -> Tensor:
+        """First observations of imagined trajectories ``(count, n)``."""
+        from_data = round(self.config.imagined_from_data * count)
+        starts = [self.start_states(count - from_data)]
+        if from_data:
+            index = torch.randint(len(buffer), (from_data,))
+            starts.append(buffer[index]["observation"])
+        return torch.cat(starts).to(self.device)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a step leaves behind beside the policy."""
+        return self.baseline.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        self.baseline.load_state_dict(state)
+
+
+def _standardize(advantage: Tensor) -> Tensor:
+    return (advantage - advantage.mean()) / (advantage.std() + 1e-8)

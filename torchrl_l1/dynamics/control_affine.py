@@ -1,0 +1,87 @@
+"""An ensemble whose members are affine in the action by construction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchrl_l1.dynamics.ensemble import ActivationName, EnsembleMLP
+from torchrl_l1.dynamics.model import EnsembleDynamics
+
+
+class ControlAffineDynamics(EnsembleDynamics):
+    r"""Control-affine ensemble model, :math:`x_{t+1} - x_t = f(x_t) + G(x_t)\, u_t`.
+
+    Each member is a network of the observation alone, with the offset :math:`f` and the columns
+    of the gain :math:`G` as its outputs: ``n + n m`` of them for the deterministic head. In
+    arXiv 2403.14860, figure 2, whose baseline this is, they are two networks. All else is as in
+    :class:`EnsembleDynamics`: arguments, normalisers, data box, members, fit. The Jacobian is
+    the ensemble's mean gain whatever the action, so the switching law never fires.
+
+    ``hidden`` is taken as it is; :func:`~torchrl_l1.dynamics.make_dynamics` matches the number
+    of parameters to that of an :class:`EnsembleDynamics`.
+
+    Examples:
+        >>> import torch
+        >>> model = ControlAffineDynamics(4, 1, members=3, hidden=(16,))
+        >>> x = torch.zeros(7, 4)
+        >>> _, at_rest = model.value_and_jacobian(x, torch.zeros(7, 1))
+        >>> _, at_full = model.value_and_jacobian(x, torch.ones(7, 1))
+        >>> torch.equal(at_rest, at_full)
+        True
+    """
+
+    def _make_network(
+        self, hidden: Sequence[int], members: int, activation: ActivationName
+    ) -> EnsembleMLP:
+        n, m = self.observation_dim, self.action_dim
+        return EnsembleMLP(n, (1 + m) * self.head.out_features(n), hidden, members, activation)
+
+    def raw(self, inputs: Tensor) -> Tensor:
+        """As in :class:`EnsembleDynamics`: all of it is affine in the action, mean or not."""
+        observation, action = self._split(inputs)
+        return _affine(*self._coefficients(self.network(observation)), action)
+
+    def raw_member(self, inputs: Tensor, member: int) -> Tensor:
+        """As :meth:`raw` for one member: ``(B, n + m)`` to ``(B, out)``."""
+        observation, action = self._split(inputs)
+        coefficients = self._coefficients(self.network.forward_member(observation, member))
+        return _affine(*coefficients, action)
+
+    def value_and_jacobian(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean predicted change and its derivative with respect to the action, in raw units.
+
+        Both come from the mean coefficients of one forward pass.
+
+        Returns:
+            change ``(..., n)`` and Jacobian ``(..., n, m)``.
+        """
+        inputs = self.normalize_inputs(observation, action)
+        flat, scaled_action = self._split(inputs.reshape(-1, inputs.shape[-1]))
+        offset, gain = self._coefficients(self.network(flat).mean(0))
+        n, m = self.observation_dim, self.action_dim
+        value = _affine(offset, gain, scaled_action)[..., :n]
+        jacobian = gain[..., :n].transpose(-2, -1)
+        scale = self.change_normalizer.std[:, None] / self.action_normalizer.std
+        return (
+            self.change_normalizer.denormalize(value).reshape(observation.shape),
+            (jacobian * scale).reshape(*observation.shape, m),
+        )
+
+    def taylor_remainder(self, observation: Tensor, u_bar: Tensor, action: Tensor) -> Tensor:
+        """Zero ``(..., n)``: the tangent in the action is the model itself."""
+        return torch.zeros_like(observation)
+
+    def _split(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        return inputs[..., : self.observation_dim], inputs[..., self.observation_dim :]
+
+    def _coefficients(self, output: Tensor) -> tuple[Tensor, Tensor]:
+        """Offset ``(..., out)`` and transposed gain ``(..., m, out)``."""
+        rows = output.unflatten(-1, (1 + self.action_dim, -1))
+        return rows[..., 0, :], rows[..., 1:, :]
+
+
+def _affine(offset: Tensor, gain: Tensor, action: Tensor) -> Tensor:
+    return offset + (gain * action.unsqueeze(-1)).sum(-2)
