@@ -6,15 +6,21 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
-from torchrl_l1.envs import TASKS, Task, get_task
+from torchrl_l1.envs import TASKS, StartStates, Task, get_task
+from torchrl_l1.envs.tasks import Task as TaskOfTheTable
 
 
 @pytest.mark.parametrize(
     ("name", "n", "m", "dt", "horizon", "bound"),
-    [("inverted_pendulum", 4, 1, 0.04, 100, 3.0), ("half_cheetah", 17, 6, 0.05, 1000, 1.0)],
+    [
+        ("inverted_pendulum", 4, 1, 0.04, 100, 3.0),
+        ("inverted_pendulum_unclamped", 4, 1, 0.04, 100, 3.0),
+        ("swimmer", 9, 2, 0.04, 1000, 1.0),
+        ("hopper", 11, 3, 0.008, 1000, 1.0),
+        ("walker", 17, 6, 0.008, 1000, 1.0),
+        ("half_cheetah", 17, 6, 0.05, 1000, 1.0),
+    ],
 )
 def test_facts_of_the_published_tasks(name, n, m, dt, horizon, bound):
     task = TASKS[name]
@@ -22,81 +28,59 @@ def test_facts_of_the_published_tasks(name, n, m, dt, horizon, bound):
     assert (task.observation_dim, task.action_dim, task.horizon) == (n, m, horizon)
     assert task.dt == pytest.approx(dt, abs=1e-12)
     assert (task.action_low, task.action_high) == (-bound, bound)
-    observation = task.observe(np.zeros((5, model.nq)), np.zeros((5, model.nv)))
-    assert observation.shape == (5, n)
+    qpos = np.zeros((5, model.nq))
+    assert task.observe(qpos, np.zeros((5, model.nv)), qpos).shape == (5, n)
 
 
-def test_build_model_equals_gymnasiums_compilation():
-    for task in TASKS.values():
-        ours = task.build_model()
-        theirs = mujoco.MjModel.from_xml_path(str(task.model_path))
-        arrays = [name for name in dir(theirs) if isinstance(getattr(theirs, name), np.ndarray)]
-        assert len(arrays) > 100
-        for name in arrays:
-            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), name)
-        assert ours.opt.integrator == theirs.opt.integrator
+def test_the_observation_of_swimmer_uses_its_own_duration():
+    task = TASKS["swimmer"]
+    moved, zeros = np.array([[task.dt, 0, 0, 0, 0]]), np.zeros((1, 5))
+    assert task.observe(moved, zeros, zeros)[0, -1] == pytest.approx(1.0)
 
 
-def test_observation_layout():
-    qpos, qvel = np.arange(9.0)[None], 100 + np.arange(9.0)[None]
-    expected = [1, 2, 3, 4, 5, 6, 7, 8, 100, 101, 102, 103, 104, 105, 106, 107, 108]
-    np.testing.assert_array_equal(TASKS["half_cheetah"].observe(qpos, qvel), [expected])
-    pendulum = TASKS["inverted_pendulum"].observe(np.array([[1.0, 2.0]]), np.array([[3.0, 4.0]]))
-    np.testing.assert_array_equal(pendulum, [[1.0, 2.0, 3.0, 4.0]])
+@pytest.mark.parametrize("name", TASKS)
+def test_build_model_equals_gymnasiums_compilation(name):
+    task = TASKS[name]
+    ours = task.build_model()
+    theirs = mujoco.MjModel.from_xml_path(str(task.model_path))
+    if name == "inverted_pendulum_unclamped":
+        assert theirs.actuator_ctrllimited.all() and not ours.actuator_ctrllimited.any()
+        theirs.actuator_ctrllimited[:] = 0
+    arrays = [name for name in dir(theirs) if isinstance(getattr(theirs, name), np.ndarray)]
+    assert len(arrays) > 100
+    for array in arrays:
+        np.testing.assert_array_equal(getattr(ours, array), getattr(theirs, array), array)
+    assert ours.opt.integrator == theirs.opt.integrator
 
 
-@given(
-    batch=st.lists(st.integers(1, 3), max_size=2),
-    dtype=st.sampled_from([torch.float32, torch.float64]),
-    seed=st.integers(0, 2**31),
-)
-def test_rewards_against_loops(batch, dtype, seed):
-    generator = torch.Generator().manual_seed(seed)
-
-    def draw(size):
-        return 2 * torch.randn(*batch, size, generator=generator, dtype=dtype)
-
-    for name, task in TASKS.items():
-        observation, action = draw(task.observation_dim), draw(task.action_dim)
-        # The reward belongs to the state before the step: whatever follows must not matter.
-        following = torch.full_like(observation, float("nan"))
-        reward = task.reward(observation, action, following)
-        assert reward.shape == tuple(batch) and reward.dtype == dtype
-        rows = zip(
-            observation.reshape(-1, task.observation_dim).tolist(),
-            action.reshape(-1, task.action_dim).tolist(),
-            reward.reshape(-1).tolist(),
-            strict=True,
-        )
-        for obs, act, value in rows:
-            if name == "inverted_pendulum":
-                expected = -(obs[1] ** 2)
-            else:
-                expected = obs[8] - 0.1 * sum(min(max(a, -1.0), 1.0) ** 2 for a in act)
-            assert value == pytest.approx(expected, rel=1e-5, abs=1e-5)
-        assert task.imagined_reward is task.reward
-        assert not task.terminated(observation).any()
-        assert task.terminated(observation).shape == tuple(batch)
+def test_walkers_feet_differ_as_the_authors_do():
+    model = TASKS["walker"].build_model()
+    friction = {foot: model.geom(foot).friction[0] for foot in ("foot_geom", "foot_left_geom")}
+    assert friction == {"foot_geom": 0.9, "foot_left_geom": 1.9}
 
 
-def test_reset_distributions():
-    rng = np.random.default_rng(0)
-    for name, half_width in (("inverted_pendulum", 0.01), ("half_cheetah", 0.1)):
-        zeros = np.zeros(9 if name == "half_cheetah" else 2)
-        qpos, qvel = TASKS[name].sample_reset(rng, zeros + 5.0, zeros, 20_000)
-        assert np.abs(qpos - 5.0).max() <= half_width
-        np.testing.assert_allclose(qpos.std(0), half_width / np.sqrt(3), rtol=0.02)
-        velocity_std = 0.1 if name == "half_cheetah" else half_width / np.sqrt(3)
-        np.testing.assert_allclose(qvel.std(0), velocity_std, rtol=0.03)
-        np.testing.assert_allclose(qvel.mean(0), 0, atol=4e-3 * velocity_std * 10)
-        if name == "half_cheetah":
-            assert np.abs(qvel).max() > 0.3  # normal, not uniform
+@pytest.mark.parametrize("name", TASKS)
+def test_imagined_starts_are_those_of_the_real_task(name):
+    task = TASKS[name]
+    torch.manual_seed(0)
+    starts = StartStates(name)(4000)
+    assert starts.shape == (4000, task.observation_dim) and starts.dtype == torch.float32
+    rest = {"hopper": 1.25, "walker": 1.25}
+    width = {"swimmer": 0.1, "half_cheetah": 0.1, "hopper": 0.005, "walker": 0.005}
+    torch.testing.assert_close(
+        starts[:, 0].mean(), torch.tensor(rest.get(name, 0.0)), rtol=0, atol=0.01
+    )
+    assert (starts[:, 0] - rest.get(name, 0.0)).abs().max() <= width.get(name, 0.01) + 1e-6
+    assert not task.terminated(starts).any()
+    if name == "swimmer":
+        assert (starts[:, -1] == 0).all()
 
 
 def test_get_task_passes_tasks_through_and_lists_names():
     task = TASKS["half_cheetah"]
     assert get_task(task) is task
-    with pytest.raises(KeyError, match=r"half_cheeta.*half_cheetah, inverted_pendulum"):
+    assert TaskOfTheTable is Task
+    with pytest.raises(KeyError, match=r"half_cheeta.*half_cheetah, hopper, inverted_pendulum"):
         get_task("half_cheeta")
 
 

@@ -73,9 +73,10 @@ def make_pipeline(
 
 
 class Collection:
-    """Collects whole episodes, ``episodes`` of them side by side.
+    """Collects episodes of ``horizon`` steps, ``episodes`` of them side by side.
 
-    Every call starts from a fresh reset and a fresh seed, so that no state outlives it.
+    An environment whose episode ends early starts another, until each has taken ``horizon``
+    steps. Every call starts from a fresh reset and a fresh seed, so that no state outlives it.
     """
 
     def __init__(
@@ -139,6 +140,8 @@ class Collection:
     ) -> TensorDictBase:
         """As many extra episodes ``[N, T]``, of the policy's mean or sampled actions.
 
+        Each environment's first episode is whole, see :func:`episode_returns`.
+
         ``callback`` is called after every step with the environment and the data so far.
         """
         _seed(self.env, seed, "evaluate", iteration)
@@ -150,7 +153,7 @@ class Collection:
 
 
 def return_metrics(data: TensorDictBase) -> dict[str, float]:
-    """Statistics of the returns of the episodes that ended within ``data``."""
+    """Statistics of the returns of the environments' first episodes."""
     returns = episode_returns(data)
     return {
         "return_mean": returns.mean().item(),
@@ -176,8 +179,14 @@ def signal_metrics(data: TensorDictBase) -> dict[str, float]:
 
 
 def episode_returns(data: TensorDictBase) -> Tensor:
-    """Undiscounted returns of the episodes that ended within ``data``: ``(episodes,)``."""
-    return data["next", "episode_reward"][data["next", "done"]]
+    """Undiscounted return of the first episode of every environment in ``[N, T]``: ``(N,)``.
+
+    Where episodes end early, others follow in the same row. They are no fair sample: those that
+    the end of the data cuts off are the long ones.
+    """
+    done = data["next", "done"].squeeze(-1)
+    first = done & (done.cumsum(1) == 1)
+    return data["next", "episode_reward"].squeeze(-1)[first]
 
 
 def _with_executed(data: TensorDictBase) -> TensorDictBase:

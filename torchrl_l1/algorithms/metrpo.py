@@ -194,7 +194,8 @@ class METRPO:
         """
         evaluate = partial(self.evaluation.evaluate, self.seed, self.iteration)
         shorter = self.collection.horizon < self.evaluation.horizon
-        sampled = evaluate(deterministic=False) if shorter else data
+        full = not shorter and not data["next", "terminated"].any()
+        sampled = data if full else evaluate(deterministic=False)
         mean_action = episode_returns(evaluate(deterministic=True))
         return {
             **return_metrics(sampled),

@@ -66,12 +66,13 @@ class METRPOConfig:
     Attributes:
         outer_iterations: rounds of fit, policy improvement and collection.
         episodes_per_iteration: real episodes per round (and of random data before the first),
-            run side by side.
+            run side by side. Where episodes end early, others follow until each environment has
+            taken as many steps as a full episode has.
         episode_steps: steps of a collected episode; the task's horizon if null. Where early
             policies fail early, shorter episodes see more of what matters. Returns are then
             measured on full episodes that do not join the data.
         evaluation_episodes: full episodes with the mean action after each round (and with
-            sampled actions if ``episode_steps`` is shorter than the horizon).
+            sampled actions if those collected are shorter than the task's, or ended early).
         trpo_iterations: TRPO steps per round.
         imagined_steps: imagined transitions per TRPO step.
         imagined_horizon: length of an imagined trajectory.

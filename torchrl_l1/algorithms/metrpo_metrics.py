@@ -13,7 +13,8 @@ METRICS: dict[str, str] = {
     "real_steps": "Real environment steps so far, the initial random ones included.",
     "return_mean": "Mean return of real episodes of the stochastic policy, with L1 if it is on; "
     "the paper's figure of merit. They are the episodes that join the data, unless `episode_steps` "
-    "makes those shorter than the task; then they are full ones beside the data.",
+    "makes those shorter than the task or one of them ended early; then they are "
+    "`evaluation_episodes` full ones beside the data.",
     "return_std": "Standard deviation over these episodes.",
     "return_min": "Lowest return among them.",
     "return_max": "Highest return among them.",

@@ -10,7 +10,7 @@ from torchrl.envs import Compose, Transform, TransformedEnv
 from .disturbances import ActuatorBias, ActuatorGain
 from .mujoco_env import BatchedMujocoEnv
 from .noise import ActionNoise, ObservationNoise
-from .tasks import Task
+from .task import Task
 
 __all__ = ["make_env"]
 

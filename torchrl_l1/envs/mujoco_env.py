@@ -10,8 +10,9 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from .simulator import MAX_MAGNITUDE, BatchedSimulator
-from .tasks import Task, get_task
+from .task import Task
+from .task_simulation import TaskSimulation
+from .tasks import get_task
 
 __all__ = ["BatchedMujocoEnv"]
 
@@ -76,11 +77,8 @@ class BatchedMujocoEnv(EnvBase):
         self.num_envs = num_envs
         self.max_steps = max_steps
         self._dtype = dtype
-        self._simulator = BatchedSimulator(task, num_envs, threads)
-        data = mujoco.MjData(self.model)
-        self._initial = (data.qpos.copy(), data.qvel.copy())
+        self._simulation = TaskSimulation(task, num_envs, threads)
         self._steps = np.zeros(num_envs, dtype=np.int64)
-        self._observation = self._observe()
         self._make_specs()
         self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
 
@@ -106,7 +104,7 @@ class BatchedMujocoEnv(EnvBase):
     @property
     def model(self) -> mujoco.MjModel:
         """The compiled MuJoCo model, shared by all environments."""
-        return self._simulator.model
+        return self._simulation.simulator.model
 
     def simulator_state(self) -> tuple[np.ndarray, np.ndarray]:
         """Current simulator states.
@@ -114,7 +112,8 @@ class BatchedMujocoEnv(EnvBase):
         Returns:
             Copies of ``qpos (N, nq)`` and ``qvel (N, nv)``, float64.
         """
-        return self._simulator.qpos.copy(), self._simulator.qvel.copy()
+        simulator = self._simulation.simulator
+        return simulator.qpos.copy(), simulator.qvel.copy()
 
     def set_simulator_state(self, qpos: np.ndarray, qvel: np.ndarray) -> Tensor:
         """Starts a new episode in every environment from a given simulator state.
@@ -132,17 +131,13 @@ class BatchedMujocoEnv(EnvBase):
         Raises:
             ValueError: if a shape is wrong or a number is not finite.
         """
-        self._simulator.set_state(qpos, qvel)
+        self._simulation.set_state(qpos, qvel)
         self._steps[:] = 0
-        self._observation = self._observe()
         return self._emitted()
-
-    def _observe(self) -> Tensor:
-        return torch.from_numpy(self.task.observe(self._simulator.qpos, self._simulator.qvel))
 
     def _emitted(self) -> Tensor:
         # A copy even in float64: in-place edits downstream must not reach the clean state.
-        return self._observation.to(self._dtype, copy=True)
+        return self._simulation.observation.to(self._dtype, copy=True)
 
     def _set_seed(self, seed: int | None) -> None:
         self._rng = np.random.default_rng(seed)
@@ -153,11 +148,8 @@ class BatchedMujocoEnv(EnvBase):
             indices = np.arange(self.num_envs)
         else:
             indices = np.flatnonzero(mask.reshape(self.num_envs, -1).any(-1).numpy())
-        if indices.size:
-            qpos, qvel = self.task.sample_reset(self._rng, *self._initial, indices.size)
-            self._simulator.set_state(qpos, qvel, indices)
-            self._steps[indices] = 0
-            self._observation = self._observe()
+        self._simulation.reset(self._rng, indices)
+        self._steps[indices] = 0
         # Environments outside the mask keep their own entries: TorchRL merges by the mask.
         flag = torch.zeros(self.num_envs, 1, dtype=torch.bool)
         return TensorDict(
@@ -173,12 +165,9 @@ class BatchedMujocoEnv(EnvBase):
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        action = self._checked(tensordict.get("action"))
-        bad = torch.from_numpy(self._simulator.step(action.numpy()))
-        previous, self._observation = self._observation, self._observe()
+        reward, terminated, bad = self._simulation.step(tensordict.get("action"))
         self._steps += 1
-        reward = self.task.reward(previous, action, self._observation)
-        terminated = (self.task.terminated(self._observation) | bad).unsqueeze(-1)
+        terminated = terminated.unsqueeze(-1)
         truncated = torch.from_numpy(self._steps >= self.max_steps).unsqueeze(-1)
         return TensorDict(
             {
@@ -192,18 +181,3 @@ class BatchedMujocoEnv(EnvBase):
             batch_size=self.batch_size,
             device=self.device,
         )
-
-    def _checked(self, action: Tensor) -> Tensor:
-        expected = (self.num_envs, self.task.action_dim)
-        if tuple(action.shape) != expected:
-            raise ValueError(f"'action' has shape {tuple(action.shape)}, expected {expected}.")
-        action = action.detach().to(torch.float64)
-        magnitude = np.abs(action.numpy())
-        # Written so that NaN fails too; MuJoCo would replace such an input by zero.
-        if not magnitude.max() <= MAX_MAGNITUDE:
-            index = int(np.flatnonzero(~(magnitude <= MAX_MAGNITUDE).all(1))[0])
-            raise ValueError(
-                f"'action' of environment {index} is {action[index].tolist()}: every entry must "
-                f"be finite and at most {MAX_MAGNITUDE:g} in magnitude. Check the policy's output."
-            )
-        return action

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from .tasks import Task
+from .task import Task
 
 __all__ = ["BatchedSimulator"]
 

@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .tasks import Task, get_task
+from .task import Task
+from .tasks import get_task
 
 __all__ = ["StartStates"]
 
@@ -35,4 +36,4 @@ class StartStates:
         seed = int(torch.randint(2**31, ()))
         rng = np.random.default_rng(seed)
         qpos, qvel = self.task.sample_reset(rng, *self._initial, count)
-        return torch.from_numpy(self.task.observe(qpos, qvel)).float()
+        return torch.from_numpy(self.task.observe(qpos, qvel, qpos)).float()

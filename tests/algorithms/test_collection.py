@@ -1,0 +1,36 @@
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+
+from torchrl_l1.algorithms.collection import Collection, Perturbation, episode_returns
+from torchrl_l1.algorithms.policy import GaussianPolicy, acting
+from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.envs import get_task
+
+
+def test_returns_are_those_of_first_episodes() -> None:
+    done = torch.tensor([[0, 1, 0, 1], [0, 0, 0, 1]], dtype=torch.bool)[..., None]
+    reward = torch.tensor([[1.0, 2.0, 10.0, 20.0], [1.0, 2.0, 3.0, 4.0]])[..., None]
+    following = {"done": done, "episode_reward": reward}
+    data = TensorDict({"next": following}, batch_size=[2, 4])
+    assert episode_returns(data).tolist() == [2.0, 4.0]
+
+
+def test_episodes_that_end_early_are_followed_by_others() -> None:
+    task = get_task("walker")
+    torch.manual_seed(0)
+    policy = GaussianPolicy(task.observation_dim, task.action_dim, [8])
+    model = EnsembleDynamics(task.observation_dim, task.action_dim, members=2, hidden=(8,))
+    collection = Collection(task, 3, acting(policy, task), model, None, Perturbation(), horizon=80)
+    data = collection.collect(0, 0)
+    assert data.shape == (3, 80)
+    ended = data["next", "terminated"].squeeze(-1)
+    assert ended.any()
+    assert len(episode_returns(data)) == 3
+    for row in range(3):
+        length = int(ended[row].nonzero()[0]) + 1
+        total = data["next", "reward"][row, :length].sum()
+        torch.testing.assert_close(episode_returns(data)[row], total)
+        # The step after a fall shows a walker that stands.
+        assert data["observation"][row, length, 0] > 1.2

@@ -1,0 +1,200 @@
+"""The benchmark tasks as single Gymnasium environments, and their registration."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium
+import mujoco
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+
+from .task import Task
+from .task_simulation import TaskSimulation
+from .tasks import TASKS, get_task
+
+__all__ = ["MujocoTaskEnv", "gymnasium_id", "register_tasks"]
+
+_ONLY = np.zeros(1, dtype=np.int64)
+
+
+class MujocoTaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One environment of a benchmark task, for Gymnasium and what builds on it.
+
+    Facts and physics are those of :class:`~torchrl_l1.envs.BatchedMujocoEnv`; only the horizon is
+    left to Gymnasium: ``gymnasium.make("torchrl_l1/HalfCheetah-v0")`` adds its ``TimeLimit``.
+    Observations are float64 and clean. The action space holds the actuators' range; actions
+    outside it are passed on as they are, and clipped where physics and reward of the task do so.
+
+    A step on which the simulation turns bad terminates the episode with the last good observation
+    and has ``info["non_finite"]`` set.
+
+    Args:
+        task: a key of :data:`~torchrl_l1.envs.TASKS`, or a :class:`~torchrl_l1.envs.Task`.
+        render_mode: ``None`` or ``"rgb_array"``. Frames come from the XML's ``track`` camera where
+            it has one.
+        width: width of a frame in pixels.
+        height: height of a frame in pixels.
+
+    Raises:
+        KeyError: if the task is unknown.
+        ValueError: if the render mode is unknown.
+
+    Examples:
+        >>> import gymnasium, torchrl_l1
+        >>> env = gymnasium.make("torchrl_l1/HalfCheetah-v0")
+        >>> observation, info = env.reset(seed=0)
+        >>> observation.shape, env.spec.max_episode_steps
+        ((17,), 1000)
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+    _renderer: mujoco.Renderer | None = None
+    _CAMERA: ClassVar[str] = "track"
+
+    def __init__(
+        self,
+        task: str | Task,
+        render_mode: str | None = None,
+        width: int = 480,
+        height: int = 480,
+    ) -> None:
+        self.task = task = get_task(task)
+        modes = self.metadata["render_modes"]
+        if render_mode is not None and render_mode not in modes:
+            raise ValueError(f"render_mode must be None or one of {modes}, got {render_mode!r}.")
+        self.metadata = {**self.metadata, "render_fps": round(1 / task.dt)}
+        self.render_mode = render_mode
+        self.width, self.height = width, height
+        self._simulation = TaskSimulation(task, 1)
+        self.observation_space = Box(-np.inf, np.inf, (task.observation_dim,), np.float64)
+        self.action_space = Box(task.action_low, task.action_high, (task.action_dim,), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Starts an episode.
+
+        Args:
+            seed: seed of this and all following resets; they continue from the last seed if
+                ``None``. With the same seed the first reset is that of a
+                :class:`~torchrl_l1.envs.BatchedMujocoEnv` with one environment.
+            options: none are known.
+
+        Returns:
+            The observation ``(n,)`` and an empty dictionary.
+        """
+        super().reset(seed=seed, options=options)
+        self._simulation.reset(self.np_random, _ONLY)
+        return self._observation(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Advances by one environment step of ``task.dt`` seconds.
+
+        Args:
+            action: actuator inputs ``(m,)``.
+
+        Returns:
+            Observation ``(n,)``, reward, whether the episode terminated, ``False`` (the horizon is
+            Gymnasium's ``TimeLimit``), and ``{"non_finite": bool}``.
+
+        Raises:
+            ValueError: if the action has the wrong shape or is not finite.
+        """
+        if np.shape(action) != self.action_space.shape:
+            raise ValueError(
+                f"action has shape {np.shape(action)}, expected {self.action_space.shape}."
+            )
+        values = torch.as_tensor(np.asarray(action, dtype=np.float64))
+        reward, terminated, bad = self._simulation.step(values.unsqueeze(0))
+        info = {"non_finite": bool(bad)}
+        return self._observation(), float(reward), bool(terminated), False, info
+
+    def simulator_state(self) -> tuple[np.ndarray, np.ndarray]:
+        """Copies of the simulator's ``qpos (nq,)`` and ``qvel (nv,)``."""
+        simulator = self._simulation.simulator
+        return simulator.qpos[0].copy(), simulator.qvel[0].copy()
+
+    def set_simulator_state(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        """Starts an episode from a given state; call it after ``reset``.
+
+        Args:
+            qpos: positions ``(nq,)``.
+            qvel: velocities ``(nv,)``.
+
+        Returns:
+            The observation ``(n,)``.
+
+        Raises:
+            ValueError: if a shape is wrong or a number is not finite.
+        """
+        self._simulation.set_state(np.asarray(qpos)[None], np.asarray(qvel)[None])
+        return self._observation()
+
+    def _observation(self) -> np.ndarray:
+        return self._simulation.observation[0].numpy().copy()
+
+    def render(self) -> np.ndarray | None:
+        """A frame ``(height, width, 3)`` of the current state, uint8; ``None`` if not asked for.
+
+        Raises:
+            RuntimeError: if OpenGL cannot draw off screen here.
+        """
+        if self.render_mode is None:
+            gymnasium.logger.warn(
+                "render() does nothing without a render mode: make the environment with "
+                'render_mode="rgb_array".'
+            )
+            return None
+        model = self._simulation.simulator.model
+        if self._renderer is None:
+            self._renderer = self._make_renderer(model)
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = self.simulator_state()
+        mujoco.mj_forward(model, data)
+        tracked = any(model.camera(i).name == self._CAMERA for i in range(model.ncam))
+        self._renderer.update_scene(data, self._CAMERA if tracked else -1)
+        frame: np.ndarray = self._renderer.render()
+        return frame
+
+    def _make_renderer(self, model: mujoco.MjModel) -> mujoco.Renderer:
+        # The XML's off-screen buffer may be smaller than the frame.
+        buffer = model.vis.global_
+        buffer.offwidth = max(buffer.offwidth, self.width)
+        buffer.offheight = max(buffer.offheight, self.height)
+        try:
+            return mujoco.Renderer(model, self.height, self.width)
+        except Exception as error:  # every OpenGL binding has exceptions of its own
+            raise RuntimeError(
+                "MuJoCo cannot draw off screen here. Set the environment variable MUJOCO_GL to egl "
+                "or osmesa before Python starts, and install that backend (libegl1, libosmesa6)."
+            ) from error
+
+    def close(self) -> None:
+        """Frees the renderer, if there is one."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+def gymnasium_id(task: str) -> str:
+    """The name under which a task is registered with Gymnasium.
+
+    Examples:
+        >>> gymnasium_id("half_cheetah")
+        'torchrl_l1/HalfCheetah-v0'
+    """
+    return f"torchrl_l1/{task.title().replace('_', '')}-v0"
+
+
+def register_tasks() -> None:
+    """Makes all tasks known to ``gymnasium.make``; importing the package does it."""
+    for name, task in TASKS.items():
+        if gymnasium_id(name) not in gymnasium.registry:
+            gymnasium.register(
+                gymnasium_id(name),
+                entry_point="torchrl_l1.envs.gymnasium_env:MujocoTaskEnv",
+                max_episode_steps=task.horizon,
+                kwargs={"task": name},
+            )
