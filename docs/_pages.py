@@ -7,7 +7,7 @@ import pkgutil
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("control", "dynamics", "envs", "objectives", "algorithms", "experiment")
+PACKAGES = ("control", "dynamics", "envs", "objectives", "algorithms", "experiment", "campaign", "report")
 
 
 def metrics_table() -> str:

@@ -1,4 +1,4 @@
-"""The command ``torchrl-l1``: run, evaluate, verify."""
+"""The command ``torchrl-l1``: run, campaign, evaluate, report, verify."""
 
 from __future__ import annotations
 
@@ -16,16 +16,19 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser("torchrl-l1", description=DESCRIPTION)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _run_parser(commands)
+    _campaign_parser(commands)
     _evaluate_parser(commands)
+    _report_parser(commands)
     verify = commands.add_parser(
         "verify", help="replay recorded traces of a reference controller in float64"
     )
     verify.add_argument("traces", help="an .npz file of recorded traces")
     verify.add_argument("--tolerance", type=float, default=1e-9, help="largest error allowed")
-    commands.add_parser("recipes", help="list the shipped recipes")
+    commands.add_parser("recipes", help="list the shipped recipes and campaigns")
 
     options, rest = parser.parse_known_args(arguments)
-    if rest and options.command != "run":
+    overridden = options.command == "campaign" and not any(o.startswith("-") for o in rest)
+    if rest and options.command != "run" and not overridden:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     # Imports wait until the arguments are known to be right: torch takes seconds to load.
     from torchrl_l1.experiment.errors import USER_ERRORS, message
@@ -33,19 +36,27 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         if options.command == "run":
             _run(options, rest)
+        elif options.command == "campaign":
+            from torchrl_l1.campaign.command import campaign_command
+
+            campaign_command(options, rest)
         elif options.command == "evaluate":
             from torchrl_l1.experiment.evaluate_command import evaluate_command
 
             evaluate_command(options)
+        elif options.command == "report":
+            from torchrl_l1.report.command import report_command
+
+            report_command(options)
         elif options.command == "verify":
             from torchrl_l1.experiment.verify import verify_command
 
             if not verify_command(options.traces, options.tolerance):
                 sys.exit(1)
         else:
-            from torchrl_l1.experiment.recipes import available_recipes
+            from torchrl_l1.experiment.recipes import available_campaigns, available_recipes
 
-            print("\n".join(available_recipes()))
+            print("\n".join([*available_recipes(), "", "Campaigns:", *available_campaigns()]))
     except USER_ERRORS as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
@@ -63,6 +74,28 @@ def _run_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     )
     run.add_argument("recipe", help="such as metrpo/inverted_pendulum, or a YAML file of yours")
     run.add_argument("--resume", action="store_true", help="continue from the last checkpoint")
+
+
+def _campaign_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    campaign = commands.add_parser(
+        "campaign",
+        help="run a matrix of runs and evaluate them",
+        usage="torchrl-l1 campaign NAME [options] [KEY=VALUE ...]",
+        description="Every combination of recipes, settings and seeds of a campaign file, each in "
+        "a process of its own. Overrides (outer_iterations=2) count for all runs. What is finished "
+        "is skipped and what was interrupted goes on, so the same command may be given again and "
+        "again.",
+    )
+    add = campaign.add_argument
+    add("campaign", metavar="NAME", help="such as table1, or a YAML file of yours")
+    add("--output", help="folder of all runs; runs/campaigns/NAME by default")
+    add("--workers", type=int, help="runs at a time; as many as there are cores by default")
+    add("--list", action="store_true", help="show the runs and how far they are, start nothing")
+    add(
+        "--launcher",
+        choices=["joblib", "submitit_slurm", "submitit_local", "ray", "basic"],
+        help="hand the runs to a Hydra launcher",
+    )
 
 
 def _evaluate_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -90,6 +123,19 @@ def _evaluate_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
     add("--seed", type=int, default=0, help="seed of resets, noise and sampled actions")
     add("--output", help="folder of the results; RUN_DIR/evaluation by default")
     add("--filmstrip", action="store_true", help="also render L1 off and on at the worst bias")
+
+
+def _report_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    report = commands.add_parser(
+        "report",
+        help="tables and figures of all runs below a folder, beside the paper's",
+        description="Writes report.md, CSV tables and PNG figures. Runs are found by their "
+        "config.yaml, in the folders and below them; nothing in them is changed.",
+    )
+    add = report.add_argument
+    add("dir", nargs="+", help="folders of runs, such as runs/campaigns/NAME")
+    add("--output", help="folder of the results; DIR/report by default")
+    add("--reference-curves", metavar="FILE", help="a CSV of the authors' curves to draw behind")
 
 
 def _run(options: argparse.Namespace, overrides: list[str]) -> None:

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import torchrl_l1
 
+# Folders beside the recipes: their groups, and matrices of runs.
+_NOT_RECIPES = ("shared", "campaigns")
+
 
 class RecipeError(Exception):
     """No such recipe; the message lists those that exist."""
@@ -34,8 +37,13 @@ def available_recipes() -> list[str]:
     return sorted(
         f"{path.parent.name}/{path.stem}"
         for path in root.glob("*/*.yaml")
-        if path.parent.name != "shared"
+        if path.parent.name not in _NOT_RECIPES
     )
+
+
+def available_campaigns() -> list[str]:
+    """Names of the shipped campaigns, such as ``table1``."""
+    return sorted(path.stem for path in (recipes_dir() / "campaigns").glob("*.yaml"))
 
 
 def find_recipe(name: str) -> Path:
@@ -44,17 +52,29 @@ def find_recipe(name: str) -> Path:
     Raises:
         RecipeError: if there is none.
     """
+    return _find("recipe", name, available_recipes(), recipes_dir())
+
+
+def find_campaign(name: str) -> Path:
+    """The YAML file of a shipped campaign, or of a path to a user's own.
+
+    Raises:
+        RecipeError: if there is none.
+    """
+    return _find("campaign", name, available_campaigns(), recipes_dir() / "campaigns")
+
+
+def _find(kind: str, name: str, available: list[str], folder: Path) -> Path:
     own = Path(name)
     if own.suffix == ".yaml":
         if not own.is_file():
-            raise RecipeError(f"recipe file {name} does not exist")
+            raise RecipeError(f"{kind} file {name} does not exist")
         return own.resolve()
-    available = available_recipes()
     if name not in available:
         close = get_close_matches(name, available, n=1)
         hint = f" Did you mean {close[0]}?" if close else ""
         raise RecipeError(
-            f"unknown recipe {name!r}.{hint} Available: {', '.join(available)}; "
+            f"unknown {kind} {name!r}.{hint} Available: {', '.join(available)}; "
             "or give the path of a .yaml file."
         )
-    return recipes_dir() / f"{name}.yaml"
+    return folder / f"{name}.yaml"

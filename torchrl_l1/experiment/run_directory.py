@@ -67,7 +67,7 @@ class RunDirectory:
                     f"{self.path} already holds a run. Continue it with --resume, or choose "
                     "another directory with run_dir=..."
                 )
-            self._check_same(config)
+            self.check_same(config)
         elif self.path.exists() and any(f.name not in _BEFORE_CONFIG for f in self.path.iterdir()):
             raise RunDirectoryError(
                 f"{self.path} is not empty and holds no run; choose another run_dir"
@@ -91,7 +91,24 @@ class RunDirectory:
         assert isinstance(stored, dict)
         return {str(key): value for key, value in stored.items()}
 
-    def _check_same(self, config: dict[str, Any]) -> None:
+    def held(self) -> bool:
+        """Whether a process is running in this directory."""
+        lock = self.path / ".lock"
+        if not lock.exists():
+            return False
+        with lock.open() as handle:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return True
+        return False
+
+    def check_same(self, config: dict[str, Any]) -> None:
+        """Compare ``config`` with that of the run that the directory holds.
+
+        Raises:
+            RunDirectoryError: if a setting differs that touches the result.
+        """
         before, now = _flatten(self._stored()), _flatten(config)
         if before.get(_MAY_GROW, 0) < now.get(_MAY_GROW, 0):
             before[_MAY_GROW] = now[_MAY_GROW]

@@ -1,0 +1,246 @@
+"""Campaign files: what they mean, and what is refused before anything starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from torchrl_l1.campaign.description import read_campaign
+from torchrl_l1.campaign.launcher import LAUNCHERS, check_launcher, sweep
+from torchrl_l1.campaign.plan import plan
+from torchrl_l1.campaign.settings import CampaignError, RunMatrix
+from torchrl_l1.campaign.yaml_file import dump_yaml, load_yaml
+from torchrl_l1.cli import main
+from torchrl_l1.experiment.recipes import RecipeError, available_campaigns, available_recipes
+
+RUNS = "runs: [{recipe: metrpo/inverted_pendulum, matrix: {l1: [off, paper], seed: [0, 1]}}]\n"
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Any:
+    def write(text: str) -> str:
+        file = tmp_path / "mine.yaml"
+        file.write_text(text)
+        return str(file)
+
+    return write
+
+
+def test_directories_are_in_matrix_order_with_the_seed_last(write: Any, tmp_path: Path) -> None:
+    file = write(
+        "runs:\n- recipe: metrpo/inverted_pendulum\n  overrides: [discount=0.9]\n"
+        "  matrix: {seed: [3, 4], noise: [none], l1: [off, paper], l1.alpha: [1e-2]}\n"
+    )
+    runs = plan(read_campaign(file, ["outer_iterations=5"]), tmp_path / "out")
+    folder = tmp_path / "out/metrpo/inverted_pendulum/noise=none"
+    # Every cell has its first seed before any has its second.
+    assert [run.directory.path for run in runs] == [
+        folder / f"l1={on}" / "l1.alpha=0.01" / f"seed_{seed}"
+        for seed in (3, 4)
+        for on in ("off", "paper")
+    ]
+    last = runs[-1].config
+    assert (last.seed, last.l1.enabled, last.l1.alpha) == (4, True, 0.01)
+    assert (last.discount, last.outer_iterations, runs[-1].iterations) == (0.9, 5, 5)
+    assert last.run_dir == str(runs[-1].directory.path)
+    assert not (tmp_path / "out").exists()
+
+
+def test_evaluations_go_to_the_runs_that_match(write: Any, tmp_path: Path) -> None:
+    file = write(
+        "runs:\n"
+        "- {recipe: metrpo/inverted_pendulum, matrix: {l1: [off, paper]}}\n"
+        "- {recipe: metrpo/half_cheetah, matrix: {noise: [none, both]}}\n"
+        "evaluations:\n"
+        "- {name: all}\n"
+        "- {name: some, where: {l1: [off]}, bias: [0, 1]}\n"
+        "- {name: some, where: {recipe: [metrpo/half_cheetah], noise: [both]}}\n"
+    )
+    found = {
+        str(run): [settings.name for settings in run.evaluations]
+        for run in plan(read_campaign(file), tmp_path)
+    }
+    assert found == {
+        "metrpo/inverted_pendulum l1=off seed=0": ["all", "some"],
+        "metrpo/inverted_pendulum l1=paper seed=0": ["all"],
+        "metrpo/half_cheetah noise=none seed=0": ["all"],
+        "metrpo/half_cheetah noise=both seed=0": ["all", "some"],
+    }
+
+
+def test_a_users_recipe_is_found_beside_the_campaign(write: Any, tmp_path: Path) -> None:
+    (tmp_path / "own.yaml").write_text(
+        "defaults: [metrpo_recipe, {l1: slow}, {noise: action}, {preset: cpu}, _self_]\n"
+        "recipe: own\ntask: half_cheetah\n"
+    )
+    file = write("runs: [{recipe: own.yaml}]\nevaluations: [{name: e, where: {recipe: [own]}}]\n")
+    campaign = read_campaign(file)
+    (run,) = plan(campaign, tmp_path)
+    assert run.directory.path == tmp_path / "own" / "seed_0"
+    assert run.evaluations
+    # What is stored in the output is itself a campaign, wherever it is read.
+    elsewhere = tmp_path / "out" / "campaign.yaml"
+    elsewhere.parent.mkdir()
+    elsewhere.write_text(dump_yaml(campaign.to_dict()))
+    again = read_campaign(str(elsewhere))
+    assert (again.name, again.runs, again.evaluations) == (
+        "mine",
+        campaign.runs,
+        campaign.evaluations,
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("runs: [", "not valid YAML"),
+        ("just words", "expected keys and values"),
+        ("description: nothing", "runs is missing"),
+        ("runs: []", "runs must be a list with at least one entry"),
+        (RUNS + "evaluation: []", "unknown key 'evaluation'. Did you mean evaluations"),
+        (RUNS + RUNS, "stands twice"),
+        ("runs: [{overrides: []}]", r"runs\[0\]: recipe is missing"),
+        ("runs: [{recipe: metrpo/pendulum}]", "unknown recipe 'metrpo/pendulum'"),
+        ("runs: [{recipe: mine2.yaml}]", "mine2.yaml does not exist"),
+        (RUNS.replace("matrix", "matrices"), "Did you mean matrix"),
+        (RUNS.replace("[0, 1]", "0"), "matrix.seed must be a list of values"),
+        (RUNS.replace("[0, 1]", "[]"), "matrix.seed must be a list of values"),
+        (RUNS.replace("[0, 1]", "[0, 0]"), "names a value twice: 0, 0"),
+        (RUNS.replace("[0, 1]", "[many]"), "seed"),
+        (RUNS.replace("paper", "../up"), "cannot name a folder"),
+        (RUNS.replace("paper", "[8]"), "matrix.l1 holds"),
+        (RUNS.replace("paper", "papr"), "papr"),
+        (RUNS.replace("l1:", "l2:"), "l2"),
+        (RUNS.replace("l1:", "run_dir:"), "run_dir is set by the campaign"),
+        (RUNS.replace("l1:", "label:"), "label must be"),
+        (RUNS.replace("matrix", "overrides: [seed=1], matrix"), "by overrides and by the matrix"),
+        (RUNS.replace("matrix", "overrides: [epsillon=1], matrix"), "epsillon"),
+        (RUNS.replace("matrix", "overrides: [resume=true], matrix"), "resume is set"),
+        (RUNS.replace("matrix", "overrides: [l1.epsilon=-1], matrix"), "epsilon"),
+        (RUNS.replace("matrix", "overrides: ['discount=0.9,0.8'], matrix"), "weep"),
+        (RUNS.replace("matrix", "overrides: [fast], matrix"), "KEY=VALUE"),
+        (RUNS + RUNS.replace("runs: [", "- ").replace("]\n", "\n"), "not valid YAML"),
+        (RUNS.replace("runs: [", "runs:\n- ").replace("}}]\n", "}}\n") * 1
+         + "- {recipe: metrpo/inverted_pendulum, matrix: {l1: [off]}}", "would share"),
+        (RUNS + "evaluations: [{l1: [off]}]", r"evaluations\[0\]: name is missing"),
+        (RUNS + "evaluations: [{name: a/b}]", "name must be a word"),
+        (RUNS + "evaluations: [{name: e, wher: {}}]", "Did you mean where"),
+        (RUNS + "evaluations: [{name: e, l1: [pape]}]", r"\(e\): unknown l1 setting 'pape'"),
+        (RUNS + "evaluations: [{name: e, noise: [loud]}]", "unknown noise setting 'loud'"),
+        (RUNS + "evaluations: [{name: e, policy: [greedy]}]", "unknown policy 'greedy'"),
+        (RUNS + "evaluations: [{name: e, episodes: 0}]", "episodes must be a whole number from 1"),
+        (RUNS + "evaluations: [{name: e, bias: [high]}]", "bias holds 'high'"),
+        (RUNS + "evaluations: [{name: e, gain: [.inf]}]", "gain must be finite"),
+        (RUNS + "evaluations: [{name: e, epsilon: 0}]", "epsilon must be positive"),
+        (RUNS + "evaluations: [{name: e, where: {l1: [slow]}}]", "no run has l1=slow; there are"),
+        (RUNS + "evaluations: [{name: e, where: {l2: [off]}}]", "none with a l2"),
+        (RUNS + "evaluations: [{name: e}, {name: e, where: {l1: [off]}}]", "another evaluation"),
+    ],
+)  # fmt: skip
+def test_refused(text: str, message: str, write: Any, tmp_path: Path) -> None:
+    with pytest.raises((CampaignError, RecipeError), match=message) as error:
+        plan(read_campaign(write(text)), tmp_path / "out")
+    assert "mine" in str(error.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_refused_on_the_command_line(
+    write: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, output = write(RUNS), str(tmp_path / "out")
+    for more, message in [
+        (["--workers", "0"], "--workers must be at least 1"),
+        (["seed=3"], "seed is set by overrides and by the matrix"),
+        (["hydra.launcher.n_jobs=2"], "give --launcher"),
+        (["noise"], "KEY=VALUE"),
+        (["--fast"], "unrecognized arguments: --fast"),
+        (["--launcher", "cloud"], "invalid choice"),
+    ]:
+        with pytest.raises(SystemExit) as exit_info:
+            main(["campaign", file, "--output", output, *more])
+        assert exit_info.value.code not in (0, None)
+        assert message in capsys.readouterr().err
+    with pytest.raises(RecipeError, match="Did you mean table1"):
+        read_campaign("table_1")
+    assert not (tmp_path / "out").exists()
+
+
+def test_launcher_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nothing(name: str) -> None:
+        raise ModuleNotFoundError(name)
+
+    monkeypatch.setattr("torchrl_l1.campaign.launcher.find_spec", nothing)
+    with pytest.raises(CampaignError, match=r"pip install 'torchrl-l1\[submitit\]'"):
+        check_launcher("submitit_slurm")
+    check_launcher("basic")
+
+
+@pytest.mark.parametrize("launcher", LAUNCHERS)
+def test_sweep_passes_workers_and_settings_on(launcher: str) -> None:
+    matrix = RunMatrix("metrpo/walker", ["noise=none"], {"l1": ["off"], "seed": [0, 1]})
+    more = ["hydra.launcher.partition=cpu"]
+    arguments = sweep(matrix, Path("/out"), launcher, 3, more)
+    assert arguments[:3] == ["run", "metrpo/walker", "-m"]
+    assert arguments[-1:] == more
+    assert {"l1=off", "seed=0,1", "noise=none", "resume=true"} < set(arguments)
+    parallel = [a for a in arguments if a.startswith("hydra.launcher.") and a not in more]
+    expected = {"joblib": ["n_jobs=3"], "submitit_slurm": ["array_parallelism=3"]}
+    assert parallel == [f"hydra.launcher.{text}" for text in expected.get(launcher, [])]
+
+
+def test_shipped_campaigns_are_the_papers(capsys: pytest.CaptureFixture[str]) -> None:
+    sizes = {}
+    for name in available_campaigns():
+        campaign = read_campaign(name)
+        sizes[name] = 0
+        for matrix in campaign.runs:
+            cells = 1
+            for values in matrix.matrix.values():
+                cells *= len(values)
+            sizes[name] += cells
+            assert ("outer_iterations=19" in matrix.overrides) == ("pendulum" in matrix.recipe)
+    assert sizes["table1"] == 5 * 3 * 2 * 10
+    assert sizes["table1_first"] == 3 * 2 * 5 + 2 * 4 + 2 * 2
+    assert sizes["figure2"] == 3 * 3 + 3 * 2
+    main(["recipes"])
+    shown = capsys.readouterr().out.split("Campaigns:")
+    assert shown[0].split() == available_recipes()
+    assert shown[1].split() == available_campaigns()
+
+
+PLAIN = st.one_of(
+    st.booleans(),
+    st.integers(),
+    st.floats(allow_nan=False),
+    st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Cs"])),
+    st.sampled_from(["off", "on", "yes", "no", "none", "null", "true", "1e-3", "1.", "0x1f"]),
+)
+
+
+@given(values=st.lists(PLAIN))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_what_is_written_is_read_again(values: list[Any], tmp_path: Path) -> None:
+    text = dump_yaml({"values": values})
+    (tmp_path / "a.yaml").write_text(text, encoding="utf-8")
+    for read in (load_yaml(tmp_path / "a.yaml"), yaml.safe_load(text)):
+        assert read == {"values": values}
+        assert list(map(type, read["values"])) == list(map(type, values))
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("off", "off"), ("On", "On"), ("yes", "yes"), ("none", "none"), ("true", True),
+        ("False", False), ("1e-3", 1e-3), ("1E5", 1e5), ("-.5", -0.5), ("3", 3), ("1.", 1.0),
+        ("0.10", 0.1), ("e5", "e5"), ("'off'", "off"), ("null", None), ("1-2", "1-2"),
+    ],
+)  # fmt: skip
+def test_words_and_numbers(text: str, value: object, tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text(f"[{text}]")
+    assert load_yaml(tmp_path / "a.yaml") == [value]
+    assert isinstance(load_yaml(tmp_path / "a.yaml")[0], type(value))

@@ -1,0 +1,116 @@
+"""The queue of subprocesses, with processes that take no time to start."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import pytest
+
+from torchrl_l1.campaign.workers import Job, Stopped, Workers, available_cores
+
+MakeJob = Callable[..., Job]
+
+
+@pytest.fixture
+def make_job(tmp_path: Path) -> MakeJob:
+    def make(
+        script: str,
+        then: Callable[[], Iterable[Job]] = list,
+        held: Callable[[], bool] = lambda: False,
+    ) -> Job:
+        return Job(script, ["sh", "-c", script], tmp_path / "deep" / "run.log", held, then)
+
+    return make
+
+
+def workers(count: int, ticks: list[int] | None = None) -> Workers:
+    seen = [] if ticks is None else ticks
+    return Workers(count, lambda running: seen.append(len(running)), lambda job: None)
+
+
+def test_failures_are_told_with_their_log_and_stop_nothing(make_job: MakeJob) -> None:
+    ended: list[str] = []
+    jobs = [
+        make_job("echo out; echo wrong >&2; exit 3"),
+        make_job("kill -9 $$"),
+        make_job("exit 0", lambda: [make_job("true", lambda: ended.append("late") or [])]),
+    ]
+    failures = workers(1).work(jobs)
+    assert [failure.status for failure in failures] == [3, -9]
+    assert str(failures[0]).startswith("echo out; echo wrong >&2; exit 3 ended with status 3")
+    assert str(failures[0]).splitlines()[1:] == ["    out", "    wrong"]
+    assert "signal 9" in str(failures[1])
+    assert ended == ["late"]
+
+
+def test_no_more_processes_than_workers_and_what_follows_comes_first(make_job: MakeJob) -> None:
+    order: list[str] = []
+
+    def note(name: str, *then: Job) -> Callable[[], list[Job]]:
+        return lambda: order.append(name) or list(then)
+
+    ticks: list[int] = []
+    evaluation = make_job("true", note("a's evaluation"))
+    jobs = [make_job("true", note("a", evaluation)), make_job("true", note("b"))]
+    workers(1, ticks).work(jobs)
+    assert order == ["a", "a's evaluation", "b"]
+    assert max(ticks) == 1
+    workers(3, ticks).work([make_job("sleep 0.5") for _ in range(5)])
+    assert max(ticks) == 3
+
+
+def test_waits_for_a_process_that_is_not_its_own(make_job: MakeJob, tmp_path: Path) -> None:
+    orphan = tmp_path / "orphan"
+    orphan.touch()
+    waited: list[str] = []
+    threading.Timer(0.3, orphan.unlink).start()
+    script = f"test ! -e {orphan}"
+    pool = Workers(1, lambda running: None, lambda job: waited.append(job.name))
+    assert pool.work([make_job(script, held=orphan.exists)]) == []
+    assert waited == [script]
+
+
+def test_tries_again_if_another_process_was_quicker(make_job: MakeJob, tmp_path: Path) -> None:
+    orphan, started = tmp_path / "orphan", tmp_path / "started"
+    threading.Timer(0.5, lambda: orphan.unlink()).start()
+    # The first attempt finds that another process has taken the directory meanwhile.
+    script = f"test -e {started} || {{ touch {started} {orphan}; exit 1; }}"
+    assert workers(1).work([make_job(script, held=orphan.exists)]) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_ends_all_processes(
+    number: signal.Signals, make_job: MakeJob, tmp_path: Path
+) -> None:
+    before = signal.getsignal(number)
+    pids = tmp_path / "pids"
+    # A run may have processes of its own.
+    jobs = [make_job(f"echo $$ >> {pids}; sleep 1000 & wait") for _ in range(3)]
+
+    def stop() -> None:
+        while not pids.exists() or len(pids.read_text().split()) < 2:
+            time.sleep(0.01)
+        os.kill(os.getpid(), number)
+
+    thread = threading.Thread(target=stop)
+    thread.start()
+    with pytest.raises(Stopped, match=number.name):
+        workers(2).work(jobs)
+    thread.join()
+    assert len(pids.read_text().split()) == 2, "a process was started after the signal"
+    for pid in map(int, pids.read_text().split()):
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+    assert signal.getsignal(number) == before
+
+
+def test_environment_has_one_thread(make_job: MakeJob) -> None:
+    job = make_job("echo $OMP_NUM_THREADS $MKL_NUM_THREADS")
+    assert workers(1).work([job]) == []
+    assert job.log.read_text() == "1 1\n"
+    assert 1 <= available_cores() <= (os.cpu_count() or 1)

@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import csv
+import re
+from pathlib import Path
+
+import pytest
+
+from torchrl_l1.report.published import published_cell, published_cells
+
+SHARED = Path(__file__).parents[3] / "shared"
+TABLES = SHARED / "reference" / "paper_tables.csv"
+PAPER = SHARED / "paper.tex"
+
+TASKS = ("inverted_pendulum", "swimmer", "hopper", "walker", "half_cheetah")
+NOISES = {"clean": "none", "action_0.1": "action", "obs_0.1": "observation"}
+NOISES["action_0.1+obs_0.1"] = "both"
+ARMS = {
+    **dict.fromkeys(("metrpo", "mbmf"), ("off", "off")),
+    **dict.fromkeys(("l1_metrpo", "l1_mbmf"), ("on", "on")),
+    "l1_metrpo_train_only": ("on", "off"),
+    "l1_metrpo_test_only": ("off", "on"),
+}
+
+
+def test_every_cell_is_there_with_numbers_and_source() -> None:
+    cells = published_cells()
+    assert len(cells) == 4 * 5 * 3 * 2
+    for (table, *_), cell in cells.items():
+        float(cell.mean)
+        assert float(cell.std) >= 0
+        assert cell.source == f"arXiv 2403.14860, Table {table}"
+
+
+@pytest.mark.skipif(not TABLES.exists(), reason="no ../shared/reference/paper_tables.csv")
+def test_cells_are_those_of_the_transcribed_tables() -> None:
+    with TABLES.open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(published_cells())
+    for row in rows:
+        table = row["table"][len("table")]
+        train, test = ARMS[row["arm"]]
+        if table == "2":
+            train, test = "off", "on" if row["arm"] == "l1_metrpo" else "off"
+        task = row["env"].removesuffix("2d")
+        cell = published_cells()[table, task, NOISES[row["noise"]], train, test]
+        assert (cell.mean, cell.std) == (row["mean"], row["std"])
+
+
+@pytest.mark.skipif(not PAPER.exists(), reason="no ../shared/paper.tex")
+def test_cells_are_those_of_the_papers_source() -> None:
+    text = re.sub(r"(?<!\\)%.*", "", PAPER.read_text())
+    tables = [
+        t for t in re.findall(r"\\begin{tabular}.*?\\end{tabular}", text, re.S) if r"\pm" in t
+    ]
+    assert len(tables) == 4
+    first = ["none", "action", "observation"]
+    noises = {"1": first, "2": ["action", "observation", "both"], "4": first, "5": first}
+    columns = {"1": ("off off", "on on"), "2": ("off off", "off on")}
+    columns |= {"4": columns["1"], "5": ("on off", "off on")}
+    for number, table in zip("1245", tables, strict=True):
+        pairs = re.findall(r"(-?[\d.]+)\s*\\pm\s*(-?[\d.]+)", table)
+        keys = [(task, noise, c) for task in TASKS for noise in noises[number] for c in (0, 1)]
+        assert len(pairs) == len(keys)
+        for pair, (task, noise, column) in zip(pairs, keys, strict=True):
+            cell = published_cells()[(number, task, noise, *columns[number][column].split())]
+            assert (cell.mean, cell.std) == pair
+
+
+def test_known_errata_are_marked_and_nothing_else() -> None:
+    marked = {key for key, cell in published_cells().items() if cell.erratum}
+    expected = {("2", "inverted_pendulum", "action", "off", "off")}
+    for noise in ("none", "action", "observation"):
+        for arm in ("off", "on"):
+            expected |= {("1", task, noise, arm, arm) for task in ("half_cheetah", "walker")}
+    copied = ("swimmer", "hopper", "half_cheetah")
+    expected |= {("4", task, "none", "off", "off") for task in copied}
+    assert marked == expected
+    assert (
+        "no return exceeds 0"
+        in published_cells()["2", "inverted_pendulum", "action", "off", "off"].erratum
+    )
+
+
+def test_cells_are_found_by_training_and_test() -> None:
+    def mean(*place: str) -> str | None:
+        cell = published_cell(*place)
+        return cell and cell.mean
+
+    assert mean("swimmer", "action", "off", "action", "off") == "258.7"
+    assert mean("swimmer", "action", "paper", "action", "paper") == "322.7"
+    assert mean("swimmer", "action", "reference", "action", "reference") == "322.7"
+    assert mean("swimmer", "none", "off", "action", "off") == "250.8"
+    assert mean("swimmer", "none", "off", "both", "paper") == "327.3"
+    assert mean("swimmer", "action", "paper", "action", "off") == "321.8"
+    assert mean("swimmer", "action", "off", "action", "paper") == "298.9"
+    assert mean("swimmer", "action", "slow", "action", "slow") is None
+    assert mean("swimmer", "action", "off", "none", "off") is None
+    assert mean("swimmer", "none", "paper", "action", "paper") is None
+    assert mean("ant", "none", "off", "none", "off") is None

@@ -1,0 +1,171 @@
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from torchrl_l1.campaign.description import read_campaign
+from torchrl_l1.campaign.yaml_file import dump_yaml
+from torchrl_l1.cli import main
+from torchrl_l1.report import report
+
+WriteRun = Callable[..., Path]
+
+CURVES = "arm,setting,seed,iteration,total_train_samples,average_return\n" + "".join(
+    f"{arm},{setting},{seed},{i},{(i + 2) * 1666},{-60 + 10 * i + seed}\n"
+    for arm, setting in (
+        ("L1_OFF", "Inverted_Pendulum"),
+        ("L1_ON", "Inverted_Pendulum"),
+        ("nl_vs_ca", "Inverted_Pendulum_ca"),
+    )
+    for seed in (1, 2)
+    for i in range(4)
+)
+
+
+def evaluations(seed: int) -> dict[str, list[dict[str, Any]]]:
+    base = {"bias": 0.0, "gain": 1.0, "episodes": 25, "policy": "stochastic", "noise": "none"}
+    rows = [
+        base | {"l1": l1, "bias": bias, "return_mean": -seed - 30 * bias * (l1 == "off")}
+        for l1 in ("off", "paper")
+        for bias in (0.0, 1.0)
+    ]
+    return {
+        "disturbances": rows,
+        "ablation": [row for row in rows if row["bias"] == 0],
+        "sim_to_real": [row | {"noise": "action"} for row in rows if row["bias"] == 0],
+        "my_own": rows[:1],
+    }
+
+
+@pytest.fixture
+def campaign(write_run: WriteRun, tmp_path: Path) -> Path:
+    """A small campaign with every kind of result in it."""
+    for seed in range(3):
+        for arm in ("off", "paper"):
+            returns = -np.geomspace(80, 0.01 * (1 + seed), 5)
+            write_run(returns, f"l1={arm}", seed=seed, evaluations=evaluations(seed))
+        write_run([-70, -60, -50, -40, -30], "l1=off", "model=affine", seed=seed)
+    write_run([-70, -60], "l1=paper", seed=3, iterations=5)
+    folder = tmp_path / "runs"
+    (folder / "campaign.yaml").write_text(dump_yaml(read_campaign("figure2").to_dict()))
+    return folder
+
+
+def test_report_joins_tables_and_figures(campaign: Path, tmp_path: Path) -> None:
+    curves = tmp_path / "curves.csv"
+    curves.write_text(CURVES)
+    page = report([campaign], reference_curves=curves)
+    assert page == campaign / "report" / "report.md"
+    text = page.read_text()
+    figures = re.findall(r"!\[[^]]+]\(([^)]+)\)", text)
+    assert figures == [
+        "learning_curves_inverted_pendulum.png",
+        "by_model_form_inverted_pendulum.png",
+        "ablation_paper.png",
+        "disturbances_inverted_pendulum_none_off.png",
+        "disturbances_inverted_pendulum_none_paper.png",
+    ]
+    for figure in figures:
+        assert matplotlib.image.imread(page.parent / figure).std() > 0.05
+    names = ("runs", "training", "pairs", "sim_to_real", "ablation", "disturbances", "my_own")
+    for name in (*names, "versions"):
+        assert f"({name}.csv)" in text
+        with (page.parent / f"{name}.csv").open() as file:
+            assert list(csv.DictReader(file)), name
+    for heading in ("Training", "L1 less baseline", "By `model.form`", "Sim to real", "Versions"):
+        assert f"\n## {heading}\n" in text
+    assert "10 runs, of which 9 are finished" in text
+    assert "seed 3: 2 of 5 iterations" in text
+    assert "9 of 15 runs finished, 1 unfinished, 5 not begun" in text
+    assert f"$ torchrl-l1 campaign figure2 --output {campaign}\n" in text
+    assert f"--reference-curves {curves}\n" in text
+    assert "| torch | 2.13.0 | 10 |" in text
+    # Of the two seeds' last three of four iterations: -50, -40 and -30, and the seed.
+    assert "| -38.5 ± 0.5 |" in text
+
+
+def test_tables_have_as_many_cells_as_columns(campaign: Path) -> None:
+    text = report([campaign]).read_text()
+    tables = re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)
+    assert len(tables) > 5
+    for table in tables:
+        assert len({line.count("|") for line in table.splitlines()}) == 1, table
+
+
+def test_runs_are_left_as_they_were_and_a_second_report_is_the_same(campaign: Path) -> None:
+    def files() -> dict[Path, bytes]:
+        return {path: path.read_bytes() for path in campaign.rglob("*.*") if path.is_file()}
+
+    before = files()
+    report([campaign])
+    first = files()
+    assert {path: content for path, content in first.items() if path in before} == before
+    report([campaign])
+    assert files() == first
+
+
+def test_campaign_with_overrides_is_repeated_from_its_file(campaign: Path) -> None:
+    own = read_campaign("figure2", ["outer_iterations=5"]).to_dict()
+    (campaign / "campaign.yaml").write_text(dump_yaml(own))
+    expected = f"$ torchrl-l1 campaign {campaign / 'campaign.yaml'} --output {campaign}\n"
+    assert expected in report([campaign]).read_text()
+
+
+def test_only_begun_runs_make_a_report_without_figures(write_run: WriteRun, tmp_path: Path) -> None:
+    write_run([], "l1=off", iterations=3)
+    page = report([tmp_path / "runs"], tmp_path / "out")
+    assert "seed 0: 0 of 3 iterations" in page.read_text()
+    assert not list(page.parent.glob("*.png"))
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit) as exit_info:
+        main(arguments)
+    assert exit_info.value.code not in (0, None)
+    printed = capsys.readouterr()
+    assert "Traceback" not in printed.err
+    return printed.err
+
+
+def test_command_says_where_the_files_are(
+    write_run: WriteRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = write_run([-2, -1], "l1=off")
+    output = tmp_path / "out"
+    main(["report", str(run), str(run.parent), "--output", str(output)])
+    printed = capsys.readouterr().out
+    assert f"Report: {output / 'report.md'}" in printed
+    assert (
+        f"$ torchrl-l1 report {run} {run.parent} --output {output}\n"
+        in (output / "report.md").read_text()
+    )
+
+
+def test_bad_requests_are_refused_before_anything_is_written(
+    write_run: WriteRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs, empty = tmp_path / "runs", tmp_path / "empty"
+    empty.mkdir()
+    assert "no run in" in refused(["report", str(empty)], capsys)
+    assert "there is no folder" in refused(["report", str(tmp_path / "nowhere")], capsys)
+    run = write_run([-2, -1], "l1=off")
+    assert "is a run directory" in refused(["report", str(runs), "--output", str(run)], capsys)
+    message = refused(["report", str(runs), "--output", str(run / "metrics.csv")], capsys)
+    assert "is a file" in message
+    nowhere = str(tmp_path / "nowhere.csv")
+    message = refused(["report", str(runs), "--reference-curves", nowhere], capsys)
+    assert "no reference curves at" in message
+    (runs / "campaign.yaml").write_text("runs: 3\n")
+    assert "is no campaign file" in refused(["report", str(runs)], capsys)
+    (runs / "campaign.yaml").unlink()
+    (run / "metrics.csv").write_text("iteration,real_steps\n0,\n")
+    assert str(run / "metrics.csv") in refused(["report", str(runs)], capsys)
+    assert not (runs / "report").exists()
+    assert not list(empty.iterdir())

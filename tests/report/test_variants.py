@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from torchrl_l1.report.runs import find_runs
+from torchrl_l1.report.variants import Cell, Study, variant_text
+
+WriteRun = Callable[..., Path]
+
+
+def cells(tmp_path: Path) -> dict[tuple[str, str, str], list[int]]:
+    """Seeds by noise, arm and variant."""
+    return {
+        (cell.noise, cell.arm, variant_text(cell.variant)): [r.identity.seed for r in runs]
+        for cell, runs in Study(find_runs([tmp_path])).cells.items()
+    }
+
+
+def test_runs_of_other_settings_are_not_pooled(write_run: WriteRun, tmp_path: Path) -> None:
+    for seed in (1, 0):
+        write_run([1], "l1=off", seed=seed)
+        write_run([1], "l1=paper", seed=seed)
+        write_run([1], "l1=paper", "label=nominal", seed=seed)
+        write_run([1], "l1=paper", "l1.epsilon=5", seed=seed)
+    write_run([1], "l1=off", "trpo_iterations=7", seed=0)
+    assert cells(tmp_path) == {
+        ("none", "off", ""): [0, 1],
+        ("none", "off", "trpo_iterations=7"): [0],
+        ("none", "paper", ""): [0, 1],
+        ("none", "paper", "l1.epsilon=5.0"): [0, 1],
+        ("none", "paper", "label=nominal"): [0, 1],
+    }
+
+
+def test_the_controllers_settings_do_not_split_the_baseline(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    write_run([1], "l1=off", "l1.epsilon=2", seed=0)
+    write_run([1], "l1=off", "l1.epsilon=3", seed=1)
+    assert list(cells(tmp_path).values()) == [[0, 1]]
+
+
+def test_main_settings_are_those_that_cover_most(write_run: WriteRun, tmp_path: Path) -> None:
+    for noise in ("none", "action"):
+        write_run([1], "l1=off", f"noise={noise}", "label=nominal")
+    for seed in range(4):
+        write_run([1], "l1=off", "label=executed", seed=seed)
+    study = Study(find_runs([tmp_path]))
+    assert study.main_settings("inverted_pendulum") == {"label": "nominal"}
+
+
+def test_ties_go_to_the_default(write_run: WriteRun, tmp_path: Path) -> None:
+    write_run([1], "l1=off", "model=affine")
+    write_run([1], "l1=off", "model=nonlinear")
+    assert list(cells(tmp_path)) == [("none", "off", ""), ("none", "off", "model.form=affine")]
+
+
+def test_of_equal_runs_the_furthest_counts(write_run: WriteRun, tmp_path: Path) -> None:
+    short = write_run([1], iterations=3, name="a")
+    long = write_run([1, 2, 3], iterations=3, name="b")
+    equal = write_run([1, 2, 3], iterations=3, name="c")
+    study = Study(find_runs([tmp_path]))
+    assert [run.path for run in study.runs] == [long]
+    assert {run.path for run in study.duplicates} == {short, equal}
+
+
+def test_comparisons_hold_departures_against_the_main_cells(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    for arm in ("off", "paper"):
+        for noise in ("none", "action"):
+            write_run([1], f"l1={arm}", f"noise={noise}")
+    write_run([1], "l1=paper", "l1.epsilon=5")
+    write_run([1], "l1=paper", "l1.epsilon=5", "l1.alpha=0.2")
+    write_run([1], "l1=paper", "label=nominal")
+    study = Study(find_runs([tmp_path]))
+    # The comparison by epsilon alone is part of that by alpha and epsilon.
+    assert study.comparisons() == [("l1.alpha", "l1.epsilon"), ("label",)]
+    found = study.compared(("l1.alpha", "l1.epsilon"))
+    assert {cell.noise for cell in found} == {"none"}
+    described = [study.describe(cell, ("l1.alpha", "l1.epsilon")) for cell in found]
+    assert described == [
+        "",
+        "l1.alpha=null, l1.epsilon=1.0",
+        "l1.alpha=null, l1.epsilon=5.0",
+        "l1.alpha=0.2, l1.epsilon=5.0",
+    ]
+
+
+def test_baseline_has_the_same_seed_noise_and_settings(write_run: WriteRun, tmp_path: Path) -> None:
+    partner = write_run([1], "l1=off", "label=nominal", seed=3)
+    write_run([1], "l1=off", "label=executed", seed=3)
+    write_run([1], "l1=off", "label=nominal", seed=4)
+    write_run([1], "l1=off", "label=nominal", "noise=action", seed=3)
+    mine = write_run([1], "l1=slow", "label=nominal", seed=3)
+    lonely = write_run([1], "l1=slow", "label=nominal", seed=5)
+    study = Study(find_runs([tmp_path]))
+    by_path = {run.path: run for run in study.runs}
+    baseline = study.baseline_of(by_path[mine])
+    assert baseline is not None and baseline.path == partner
+    assert study.baseline_of(by_path[lonely]) is None
+
+
+def test_tasks_and_noises_come_in_the_papers_order(write_run: WriteRun, tmp_path: Path) -> None:
+    write_run([1], "l1=off", recipe="metrpo/half_cheetah")
+    write_run([1], "l1=off", "noise=observation")
+    write_run([1], "l1=off", "noise=action")
+    write_run([1], "l1=paper", "noise=action")
+    assert list(Study(find_runs([tmp_path])).cells) == [
+        Cell("inverted_pendulum", "action", "off"),
+        Cell("inverted_pendulum", "action", "paper"),
+        Cell("inverted_pendulum", "observation", "off"),
+        Cell("half_cheetah", "none", "off"),
+    ]
+
+
+def test_variants_come_in_the_order_of_their_numbers(write_run: WriteRun, tmp_path: Path) -> None:
+    for epsilon in ("10", "1", "0.1", "3"):
+        write_run([1], "l1=paper", f"l1.epsilon={epsilon}")
+    write_run([1], "l1=paper", "noise=action", "l1.epsilon=1")
+    study = Study(find_runs([tmp_path]))
+    found = [study.describe(cell, ("l1.epsilon",)) for cell in study.compared(("l1.epsilon",))]
+    assert found == [f"l1.epsilon={value}" for value in ("1.0", "0.1", "3.0", "10.0")]

@@ -1,0 +1,48 @@
+"""The processes that a campaign starts: ``PARENT run ...`` or ``PARENT evaluate DIR JSON``.
+
+Not for users: they end when the campaign's own process, PARENT, ends, however it does.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import sys
+from collections.abc import Sequence
+
+_PR_SET_PDEATHSIG = 1
+
+
+def end_with(parent: int) -> None:
+    """Let the system kill this process when its parent ends. Linux only; elsewhere it lives on.
+
+    A run that lives on holds its run directory, and the campaign waits for it when it is
+    started again. Nothing is lost either way: all files are replaced atomically.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:  # it ended before the system was told
+        sys.exit("the campaign has ended")
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Entry point of the process."""
+    parent, command, *rest = arguments
+    end_with(int(parent))
+    if command == "evaluate":
+        from torchrl_l1.campaign.evaluation import evaluate_run
+
+        run_dir, evaluations = rest
+        for name, settings in json.loads(evaluations).items():
+            print(f"Evaluated: {evaluate_run(run_dir, name, settings)}", flush=True)
+    else:
+        from torchrl_l1.cli import main as command_line
+
+        command_line([command, *rest])
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,76 @@
+"""``torchrl-l1 campaign``: run a matrix of runs and their evaluations, or say how far they are."""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from torchrl_l1.campaign.description import read_campaign
+from torchrl_l1.campaign.jobs import launch_runs, work_on_runs
+from torchrl_l1.campaign.launcher import check_launcher
+from torchrl_l1.campaign.plan import plan
+from torchrl_l1.campaign.progress import overview
+from torchrl_l1.campaign.settings import CampaignError, override_key
+from torchrl_l1.campaign.workers import Stopped, available_cores
+from torchrl_l1.campaign.yaml_file import dump_yaml
+from torchrl_l1.experiment.run_directory import write_atomically
+
+
+def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> None:
+    """``torchrl-l1 campaign``. Exits with a non-zero status if a run failed or it was stopped.
+
+    Raises:
+        CampaignError: if the campaign cannot run as asked; nothing has been started then.
+        RunDirectoryError: if a run directory holds a run of another configuration.
+    """
+    if options.workers is not None and options.workers < 1:
+        raise CampaignError(f"--workers must be at least 1, got {options.workers}")
+    for_hydra = [text for text in overrides if override_key(text).split(".")[0] == "hydra"]
+    if for_hydra and not options.launcher:
+        raise CampaignError(f"{for_hydra[0]} is for Hydra's launchers; give --launcher as well")
+    if options.launcher:
+        check_launcher(options.launcher)
+    campaign = read_campaign(options.campaign, [o for o in overrides if o not in for_hydra])
+    output = Path(options.output or f"runs/campaigns/{campaign.name}").resolve()
+    runs = plan(campaign, output)
+    if options.list:
+        print(overview(runs))
+        return
+    output.mkdir(parents=True, exist_ok=True)
+    failures = []
+    with _hold(output):
+        write_atomically(output / "campaign.yaml", dump_yaml(campaign.to_dict()))
+        try:
+            if options.launcher:
+                failures = launch_runs(
+                    campaign, output, runs, options.launcher, options.workers, for_hydra
+                )
+                runs_here = [run for run in runs if run.finished()]
+            else:
+                runs_here = runs
+            failures += work_on_runs(runs_here, options.workers or available_cores())
+        except Stopped as stopped:
+            print(f"{stopped}; the same command goes on from there", file=sys.stderr)
+            sys.exit(128 + stopped.signal_number)
+    for failure in failures:
+        print(failure, file=sys.stderr)
+    if failures:
+        print(f"{len(failures)} failed; the same command tries them again", file=sys.stderr)
+        sys.exit(1)
+    print(f"Finished: {len(runs)} runs in {output}")
+
+
+@contextmanager
+def _hold(output: Path) -> Iterator[None]:
+    with (output / ".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise CampaignError(
+                f"another campaign is running in {output}; wait for it, or choose another --output"
+            ) from error
+        yield

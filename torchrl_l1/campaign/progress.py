@@ -1,0 +1,124 @@
+"""How far a campaign is: a table of its runs, a bar, and a line for each finished run."""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections import Counter
+from collections.abc import Sequence
+
+from tqdm import tqdm
+
+from torchrl_l1.campaign.evaluation import is_evaluated
+from torchrl_l1.campaign.runs import PlannedRun
+
+REFRESH_SECONDS = 2.0
+
+
+def state(run: PlannedRun) -> str:
+    """One of ``waiting``, ``K of N iterations`` and ``finished``, with evaluations if any."""
+    done = run.iterations_done()
+    if done < run.iterations:
+        started = run.directory.config_file.exists()
+        return f"{done} of {run.iterations} iterations" if started else "waiting"
+    if not run.evaluations:
+        return "finished"
+    evaluated = sum(is_evaluated(run.directory, settings) for settings in run.evaluations)
+    return f"finished, {evaluated} of {len(run.evaluations)} evaluations"
+
+
+def overview(runs: Sequence[PlannedRun]) -> str:
+    """All runs with their states, a line for each, and a sum."""
+    states = [state(run) for run in runs]
+    width = max(map(len, states))
+    lines = [f"{text:<{width}}  {run}" for text, run in zip(states, runs, strict=True)]
+    kinds = Counter(
+        text.split(",")[0] if "finished" in text or text == "waiting" else "begun"
+        for text in states
+    )
+    done = sum(run.iterations_done() for run in runs)
+    total = sum(run.iterations for run in runs)
+    lines.append(
+        f"{len(runs)} runs: {kinds['finished']} finished, {kinds['begun']} begun, "
+        f"{kinds['waiting']} waiting; {done} of {total} iterations"
+    )
+    return "\n".join(lines)
+
+
+def result(run: PlannedRun) -> str:
+    """Where a finished run has got to, from the last line of its metrics."""
+    with run.directory.metrics_file.open(encoding="utf-8", newline="") as file:
+        last = list(csv.DictReader(file))[-1]
+    return (
+        f"return {float(last['return_mean']):.5g} "
+        f"(deterministic {float(last['return_deterministic']):.5g}) "
+        f"after {last['real_steps']} real steps"
+    )
+
+
+class Progress:
+    """A bar over the outer iterations of all runs, which reads the runs' own tables.
+
+    Args:
+        runs: all runs of the campaign.
+    """
+
+    def __init__(self, runs: Sequence[PlannedRun]) -> None:
+        self._done = {id(run): run.iterations_done() for run in runs}
+        self._runs = runs
+        self._ended = {id(run) for run in runs if run.finished()}
+        self._to_evaluate = sum(not _is_evaluated(run) for run in runs)
+        self._start = time.monotonic()
+        self._first = sum(self._done.values())
+        self._next = 0.0
+        # No smoothing: iterations of different tasks take different times, the mean is steadier.
+        self._bar = tqdm(
+            total=sum(run.iterations for run in runs),
+            initial=self._first,
+            unit="iteration",
+            smoothing=0,
+            disable=None,
+        )
+
+    def tick(self, running: int) -> None:
+        """Look at the runs again, if it is time to."""
+        if time.monotonic() < self._next:
+            return
+        self._next = time.monotonic() + REFRESH_SECONDS
+        for run in self._runs:
+            if self._done[id(run)] < run.iterations:
+                self._done[id(run)] = run.iterations_done()
+        self._bar.set_postfix_str(f"{running} running, {self._to_evaluate} to evaluate")
+        self._bar.update(sum(self._done.values()) - self._bar.n)
+
+    def write(self, line: str) -> None:
+        """Print a line above the bar."""
+        self._bar.write(line)
+
+    def finished(self, run: PlannedRun) -> None:
+        """A run has ended well: print its result and an estimate of the time left."""
+        self._done[id(run)] = run.iterations
+        self._ended.add(id(run))
+        count = f"{len(self._ended)} of {len(self._runs)} runs"
+        self.write(f"finished {run}: {result(run)}; {count}{self._time_left()}")
+
+    def evaluated(self, run: PlannedRun) -> None:
+        """The evaluations of a run have ended well."""
+        self._to_evaluate -= 1
+        self.write(f"evaluated {run}")
+
+    def close(self) -> None:
+        """Leave the bar as it is."""
+        self._bar.close()
+
+    def _time_left(self) -> str:
+        done = sum(self._done.values())
+        left = sum(run.iterations for run in self._runs) - done
+        if left == 0 or done == self._first:
+            return ""
+        seconds = (time.monotonic() - self._start) * left / (done - self._first)
+        return f", about {tqdm.format_interval(seconds)} of training left"
+
+
+def _is_evaluated(run: PlannedRun) -> bool:
+    return all(is_evaluated(run.directory, settings) for settings in run.evaluations)

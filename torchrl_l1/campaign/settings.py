@@ -1,0 +1,191 @@
+"""What a campaign is made of: matrices of runs and the evaluations of each run."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+# What may become part of a path and of a Hydra override without quotes.
+_PLAIN = re.compile(r"[A-Za-z0-9_.+-]+")
+_RESERVED = ("run_dir", "resume")
+_POLICIES = ("stochastic", "deterministic")
+
+
+class CampaignError(ValueError):
+    """A campaign cannot be run as asked; the message says where the fault lies."""
+
+
+@dataclass
+class RunMatrix:
+    """Runs of one recipe: every combination of the matrix' values.
+
+    Attributes:
+        recipe: a shipped recipe, or a YAML file of the user's, found from the campaign file.
+        overrides: Hydra overrides for all of these runs.
+        matrix: values by key; a key is a recipe group or a setting. ``seed`` is ``[0]`` if absent.
+    """
+
+    recipe: str
+    overrides: list[str] = field(default_factory=list)
+    matrix: dict[str, list[Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check types and names, and put the seed last.
+
+        Raises:
+            CampaignError: naming the key.
+        """
+        _check_list("overrides", self.overrides, str)
+        if not isinstance(self.matrix, dict):
+            raise CampaignError(f"matrix must map keys to lists of values, got {self.matrix!r}")
+        for key, values in self.matrix.items():
+            _check_list(f"matrix.{key}", values, (str, int, float), filled=True)
+            texts = [value_text(value) for value in values]
+            for text in texts:
+                if not _PLAIN.fullmatch(text):
+                    raise CampaignError(
+                        f"matrix.{key}: {text!r} cannot name a folder; give a word or a number, "
+                        "and move what all runs share to overrides"
+                    )
+            if len(set(texts)) < len(texts):
+                raise CampaignError(f"matrix.{key} names a value twice: {', '.join(texts)}")
+        for key in [*self.matrix, *map(override_key, self.overrides)]:
+            if key in _RESERVED:
+                raise CampaignError(f"{key} is set by the campaign itself; leave it out")
+        for key in map(override_key, self.overrides):
+            if key in self.matrix:
+                raise CampaignError(
+                    f"{key} is set by overrides and by the matrix; leave one of them out"
+                )
+        seeds = {"seed": self.matrix.get("seed", [0])}
+        self.matrix = {k: v for k, v in self.matrix.items() if k != "seed"} | seeds
+
+
+@dataclass
+class EvaluationSettings:
+    """An evaluation of frozen policies, for each finished run that matches.
+
+    Attributes:
+        name: of the table ``RUN_DIR/evaluations/NAME.csv``.
+        where: values that a run must have, by matrix key (or ``recipe``); no key, every run.
+        l1: settings of the ``l1`` group.
+        noise: settings of the ``noise`` group.
+        bias: actuator biases, action units.
+        gain: actuator gains.
+        policy: ``stochastic`` and ``deterministic``.
+        episodes: episodes per cell.
+        seed: seed of resets, noise and sampled actions.
+        epsilon: tolerance of the switching law, raw state units; the run's own if null.
+    """
+
+    name: str
+    where: dict[str, list[Any]] = field(default_factory=dict)
+    l1: list[str] = field(default_factory=lambda: ["off", "paper"])
+    noise: list[str] = field(default_factory=lambda: ["none"])
+    bias: list[float] = field(default_factory=lambda: [0.0])
+    gain: list[float] = field(default_factory=lambda: [1.0])
+    policy: list[str] = field(default_factory=lambda: list(_POLICIES))
+    episodes: int = 25
+    seed: int = 0
+    epsilon: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check types and ranges.
+
+        Raises:
+            CampaignError: naming the key.
+        """
+        if not isinstance(self.name, str) or not _PLAIN.fullmatch(self.name):
+            raise CampaignError(f"name must be a word, got {self.name!r}")
+        if not isinstance(self.where, dict):
+            raise CampaignError(f"where must map keys to lists of values, got {self.where!r}")
+        for key, values in self.where.items():
+            _check_list(f"where.{key}", values, (str, int, float), filled=True)
+        for key in ("l1", "noise", "policy"):
+            _check_list(key, getattr(self, key), str, filled=True)
+        for key in ("bias", "gain"):
+            _check_list(key, getattr(self, key), (int, float), filled=True)
+            setattr(self, key, [float(value) for value in getattr(self, key)])
+            if not all(map(math.isfinite, getattr(self, key))):
+                raise CampaignError(f"{key} must be finite, got {getattr(self, key)}")
+        unknown = [policy for policy in self.policy if policy not in _POLICIES]
+        if unknown:
+            raise CampaignError(f"unknown policy {unknown[0]!r}; there are {', '.join(_POLICIES)}")
+        for key, least in (("episodes", 1), ("seed", 0)):
+            value = getattr(self, key)
+            if not isinstance(value, int) or isinstance(value, bool) or value < least:
+                raise CampaignError(f"{key} must be a whole number from {least}, got {value!r}")
+        if self.epsilon is not None:
+            if not isinstance(self.epsilon, (int, float)) or not self.epsilon > 0:
+                raise CampaignError(f"epsilon must be positive or null, got {self.epsilon!r}")
+            self.epsilon = float(self.epsilon)
+
+    def of_a_run(self) -> dict[str, Any]:
+        """What the table of a single run depends on: all settings but ``name`` and ``where``."""
+        settings = asdict(self)
+        del settings["name"], settings["where"]
+        return settings
+
+
+@dataclass
+class Campaign:
+    """A campaign file, read and checked.
+
+    Attributes:
+        name: the name of the campaign.
+        file: where it was read from.
+        description: one line.
+        runs: matrices of runs.
+        evaluations: evaluations of the finished runs.
+    """
+
+    name: str
+    file: Path
+    description: str
+    runs: list[RunMatrix]
+    evaluations: list[EvaluationSettings]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The resolved campaign as plain lists and dictionaries."""
+        whole = asdict(self)
+        del whole["file"]
+        return whole
+
+
+def value_text(value: Any) -> str:
+    """A value as Hydra writes and reads it.
+
+    Examples:
+        >>> [value_text(value) for value in ("off", 3, 0.5, True)]
+        ['off', '3', '0.5', 'true']
+    """
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def override_key(override: str) -> str:
+    """The key of a Hydra override.
+
+    Raises:
+        CampaignError: if it has none.
+
+    Examples:
+        >>> override_key("+l1.epsilon=0.5")
+        'l1.epsilon'
+    """
+    key, equals, _ = override.partition("=")
+    if not equals or not key.strip("+~"):
+        raise CampaignError(f"{override!r} is not an override; write KEY=VALUE")
+    return key.strip("+~").partition("@")[0]
+
+
+def _check_list(
+    key: str, values: Any, kinds: type | tuple[type, ...], filled: bool = False
+) -> None:
+    if not isinstance(values, list) or (filled and not values):
+        raise CampaignError(f"{key} must be a list{' of values' * filled}, got {values!r}")
+    for value in values:
+        if not isinstance(value, kinds):
+            raise CampaignError(f"{key} holds {value!r}, which is no plain value of its kind")

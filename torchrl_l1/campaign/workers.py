@@ -1,0 +1,188 @@
+"""A queue of subprocesses, some of them at a time."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+POLL_SECONDS = 0.1
+GRACE_SECONDS = 10.0
+_LAST_LINES = 15
+
+
+@dataclass
+class Job:
+    """A process to be started.
+
+    Attributes:
+        name: for messages.
+        command: what is started.
+        log: file that its output is appended to.
+        held: whether a process that is not ours is at the same work now.
+        done: called once it has ended well; what it gives is started next.
+    """
+
+    name: str
+    command: Sequence[str]
+    log: Path
+    held: Callable[[], bool]
+    done: Callable[[], Iterable[Job]]
+
+
+@dataclass
+class Failure:
+    """A job that ended badly.
+
+    Attributes:
+        job: which.
+        status: its exit status, negative for a signal.
+    """
+
+    job: Job
+    status: int
+
+    def __str__(self) -> str:
+        """Name, status and the end of the log."""
+        how = f"signal {-self.status}" if self.status < 0 else f"status {self.status}"
+        lines = self.job.log.read_text(encoding="utf-8", errors="replace").splitlines()
+        tail = "\n".join(f"    {line}" for line in lines[-_LAST_LINES:])
+        return f"{self.job.name} ended with {how}; the end of {self.job.log}:\n{tail}"
+
+
+class Stopped(Exception):
+    """The campaign was told to stop; all its processes have ended."""
+
+    def __init__(self, signal_number: int) -> None:
+        super().__init__(f"stopped by {signal.Signals(signal_number).name}")
+        self.signal_number = signal_number
+
+
+class Workers:
+    """Runs jobs, ``count`` at a time, in the calling thread.
+
+    Each process has one thread and a session of its own, so that a Ctrl-C reaches the campaign
+    alone, which then ends them. It must be the main thread: on Linux the system ends the
+    processes when the thread that started them does.
+
+    Args:
+        count: processes at a time.
+        on_tick: called again and again with the jobs that are running.
+        on_wait: called once with each job that waits for a process that is not ours.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        on_tick: Callable[[Sequence[Job]], None],
+        on_wait: Callable[[Job], None],
+    ) -> None:
+        self.count = count
+        self._on_tick, self._on_wait = on_tick, on_wait
+        self._queue: deque[Job] = deque()
+        self._running: list[tuple[Job, subprocess.Popen[bytes]]] = []
+        self._waiting: set[int] = set()
+        self._failures: list[Failure] = []
+        self._stop: int | None = None
+
+    def work(self, jobs: Iterable[Job]) -> list[Failure]:
+        """Run all jobs and what they lead to.
+
+        Returns:
+            the jobs that ended badly; the others went on.
+
+        Raises:
+            Stopped: after SIGINT or SIGTERM, once every process has ended.
+        """
+        self._queue.extend(jobs)
+        with self._signals():
+            try:
+                while self._queue or self._running:
+                    if self._stop is not None:
+                        raise Stopped(self._stop)
+                    self._start()
+                    self._collect()
+                    self._on_tick([job for job, _ in self._running])
+                    time.sleep(POLL_SECONDS)
+            finally:
+                self._end_all()
+        return self._failures
+
+    def _start(self) -> None:
+        for job in list(self._queue):
+            if len(self._running) >= self.count:
+                break
+            if job.held():
+                if id(job) not in self._waiting:
+                    self._waiting.add(id(job))
+                    self._on_wait(job)
+                continue
+            self._queue.remove(job)
+            job.log.parent.mkdir(parents=True, exist_ok=True)
+            with job.log.open("ab") as log:
+                process = subprocess.Popen(
+                    job.command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    env={**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
+                    start_new_session=True,
+                )
+            self._running.append((job, process))
+
+    def _collect(self) -> None:
+        for entry in list(self._running):
+            job, process = entry
+            status = process.poll()
+            if status is None:
+                continue
+            self._running.remove(entry)
+            if status == 0:
+                self._queue.extendleft(reversed(list(job.done())))
+            elif job.held():
+                self._queue.append(job)  # another process was quicker; wait for it
+            else:
+                self._failures.append(Failure(job, status))
+
+    def _end_all(self) -> None:
+        for _, process in self._running:
+            _signal_session(process, signal.SIGTERM)
+        deadline = time.monotonic() + GRACE_SECONDS
+        for _, process in self._running:
+            try:
+                process.wait(max(deadline - time.monotonic(), 0))
+            except subprocess.TimeoutExpired:
+                _signal_session(process, signal.SIGKILL)
+                process.wait()
+        self._running.clear()
+
+    @contextmanager
+    def _signals(self) -> Iterator[None]:
+        def note(signal_number: int, frame: FrameType | None) -> None:
+            self._stop = signal_number
+
+        before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def _signal_session(process: subprocess.Popen[bytes], number: int) -> None:
+    # The session outlives its leader if that had children; once all are gone there is none.
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, number)
+
+
+def available_cores() -> int:
+    """CPU cores that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)  # not on macOS
+    return len(affinity(0)) if affinity else os.cpu_count() or 1

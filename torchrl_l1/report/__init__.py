@@ -1,0 +1,23 @@
+"""Reports: the paper's tables and curves, ours beside the published ones."""
+
+from __future__ import annotations
+
+from torchrl_l1.report.build import report
+from torchrl_l1.report.published import PublishedCell, published_cell, published_cells
+from torchrl_l1.report.reference_curves import Curves, ReferenceCurves
+from torchrl_l1.report.runs import Evaluation, Run, find_runs
+from torchrl_l1.report.variants import Cell, Study
+
+__all__ = [
+    "Cell",
+    "Curves",
+    "Evaluation",
+    "PublishedCell",
+    "ReferenceCurves",
+    "Run",
+    "Study",
+    "find_runs",
+    "published_cell",
+    "published_cells",
+    "report",
+]

@@ -1,0 +1,84 @@
+"""From run directories to a report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from torchrl_l1.experiment.run_directory import write_atomically
+from torchrl_l1.report.campaigns import find_campaigns
+from torchrl_l1.report.evaluation_sections import evaluation_sections
+from torchrl_l1.report.page import Page
+from torchrl_l1.report.reference_curves import ReferenceCurves
+from torchrl_l1.report.runs import find_runs
+from torchrl_l1.report.training_sections import training_sections
+from torchrl_l1.report.training_tables import run_rows
+from torchrl_l1.report.variants import Study
+
+__all__ = ["report"]
+
+
+def report(
+    folders: Sequence[Path], output: Path | None = None, reference_curves: Path | None = None
+) -> Path:
+    """Write tables, figures and a page of all runs in or below some folders.
+
+    Everything is read before anything is written.
+
+    Args:
+        folders: where to look.
+        output: folder of the results; ``report`` in the first folder by default.
+        reference_curves: learning curves to draw behind, see :class:`ReferenceCurves`.
+
+    Returns:
+        the page, ``report.md``.
+
+    Raises:
+        FileNotFoundError: if a folder or file does not exist, or no run is found.
+        RunDirectoryError: if a run's files cannot be read.
+        ValueError: if the output folder is a run directory, or the curves cannot be read.
+    """
+    output = folders[0] / "report" if output is None else output
+    if (output / "config.yaml").exists():
+        raise ValueError(f"{output} is a run directory; choose another --output")
+    if output.exists() and not output.is_dir():
+        raise ValueError(f"--output {output} is a file; give a folder")
+    reference = None if reference_curves is None else ReferenceCurves(reference_curves)
+    runs = find_runs(folders)
+    campaigns = find_campaigns(folders, runs)
+    study = Study(runs)
+    output.mkdir(parents=True, exist_ok=True)
+
+    page = Page(output)
+    _introduction(page, study, _command(folders, output, reference_curves))
+    page.campaigns(campaigns)
+    training_sections(page, study, reference)
+    evaluation_sections(page, study)
+    page.heading("Versions", "What the runs ran with, from their `versions.json`.")
+    page.versions(runs)
+    file = output / "report.md"
+    write_atomically(file, page.render())
+    return file
+
+
+def _introduction(page: Page, study: Study, command: str) -> None:
+    unfinished = sum(not run.finished for run in study.runs)
+    page.text(
+        f"{len(study.runs)} runs, of which {len(study.runs) - unfinished} are finished; only "
+        "these enter means, intervals and differences. Every run's settings are in the "
+        "`config.yaml` of its directory.",
+        f"```console\n$ {command}\n```",
+    )
+    page.csv("runs", run_rows(study))
+    if study.duplicates:
+        left_out = "\n".join(f"- {run.path}" for run in study.duplicates)
+        page.text(f"Left out, since another run has the same settings and seed:\n\n{left_out}")
+
+
+def _command(folders: Sequence[Path], output: Path, reference_curves: Path | None) -> str:
+    words = ["torchrl-l1 report", *map(str, folders)]
+    if output != folders[0] / "report":
+        words.append(f"--output {output}")
+    if reference_curves is not None:
+        words.append(f"--reference-curves {reference_curves}")
+    return " ".join(words)

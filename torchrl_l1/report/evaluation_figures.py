@@ -1,0 +1,125 @@
+"""Ablation bars and disturbance charts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from torchrl_l1.report.evaluation_tables import PHASES
+from torchrl_l1.report.style import arm_label, color, fit_scale, grid, legend_below, save, title
+from torchrl_l1.report.variants import noise_order
+
+__all__ = ["plot_ablation", "plot_disturbances"]
+
+Row = Mapping[str, Any]
+
+
+def plot_ablation(rows: Sequence[Row], file: Path) -> Path:
+    """Bars of return with L1 in neither phase, one of them, or both; a panel per task.
+
+    Args:
+        rows: of :func:`~torchrl_l1.report.evaluation_tables.ablation_rows`, of one kind of policy,
+            one kind of L1 and one variant.
+        file: where to.
+    """
+    tasks = list(dict.fromkeys(row["task"] for row in rows))
+    figure, axes = grid(len(tasks), columns=2, width=6.2, height=3.6)
+    for axis, task in zip(axes, tasks, strict=True):
+        mine = [row for row in rows if row["task"] == task]
+        noises = sorted({row["noise"] for row in mine}, key=noise_order)
+        fit_scale([axis], [_values(row) for row in mine])
+        for row in mine:
+            index = PHASES.index(row["phase"])
+            x = noises.index(row["noise"]) + (index - 1.5) * 0.2
+            _bar(axis, x, row, color(index))
+        axis.axhline(0, color="black", linewidth=0.8)
+        axis.set_xticks(range(len(noises)), [f"noise: {noise}" for noise in noises])
+        axis.set_xlim(-0.6, len(noises) - 0.4)
+        axis.set_ylabel("return (sum of rewards)")
+        axis.set_title(title(task), fontsize=10)
+        axis.grid(axis="y", alpha=0.3)
+    legend_below(figure, axes)
+    return save(figure, file)
+
+
+def _bar(axis: Axes, x: float, row: Row, shade: str) -> None:
+    name = row["phase"]
+    label = f"L1 in {name if name != 'both' else 'both phases'}".replace("in neither", "off")
+    axis.bar(x, row["return_mean"], 0.18, color=shade, alpha=0.75, label=label)
+    values = _values(row)
+    # Side by side, so that seeds with equal returns do not hide each other.
+    spread = np.linspace(-0.05, 0.05, len(values)) if len(values) > 1 else np.zeros(1)
+    axis.plot(x + spread, values, ".", color="black", markersize=3.5, alpha=0.7, zorder=3)
+    if row.get("return_low") is not None:
+        axis.vlines(x, row["return_low"], row["return_high"], color="black", linewidth=1.4)
+
+
+def plot_disturbances(rows: Sequence[Row], heading: str, file: Path) -> Path | None:
+    """Return against actuator bias and against actuator gain, with bootstrap intervals.
+
+    Args:
+        rows: of one training cell, tested under several biases and gains.
+        heading: title of the figure.
+        file: where to.
+
+    Returns:
+        the file, or ``None`` if neither bias nor gain varies.
+    """
+    panels = []
+    for policy, noise in dict.fromkeys((row["policy"], row["noise"]) for row in rows):
+        for what, other, neutral in (("bias", "gain", 1.0), ("gain", "bias", 0.0)):
+            chosen = [
+                row
+                for row in rows
+                if (row["policy"], row["noise"], row[other]) == (policy, noise, neutral)
+            ]
+            if len({row[what] for row in chosen}) > 1:
+                panels.append((_panel_title(policy, noise), what, chosen))
+    if not panels:
+        return None
+    figure, axes = grid(len(panels), columns=2, width=5.2, height=3.7)
+    shown: list[Sequence[float]] = []
+    for axis, (name, what, chosen) in zip(axes, panels, strict=True):
+        shown += _draw_disturbance(axis, what, chosen)
+        axis.set_title(name, fontsize=10)
+    fit_scale(axes, shown)
+    figure.suptitle(heading, fontsize=11)
+    legend_below(figure, axes)
+    return save(figure, file)
+
+
+def _panel_title(policy: str, noise: str) -> str:
+    actions = {"stochastic": "sampled actions", "deterministic": "mean action"}
+    name = actions.get(policy, policy)
+    return name if noise == "none" else f"{name}, noise: {noise}"
+
+
+def _draw_disturbance(axis: Axes, what: str, rows: Sequence[Row]) -> list[Sequence[float]]:
+    """Draw a panel; returns the values in it."""
+    shown: list[Sequence[float]] = []
+    for index, tested in enumerate(dict.fromkeys(row["l1"] for row in rows)):
+        line = sorted((row for row in rows if row["l1"] == tested), key=lambda row: row[what])
+        x = [row[what] for row in line]
+        shade = color(3 + index, tested)
+        means = [row["return_mean"] for row in line]
+        axis.plot(x, means, "o-", color=shade, markersize=4, label=arm_label(tested))
+        shown.append(means)
+        limits = [row for row in line if row.get("return_low") is not None]
+        if limits:
+            low, high = ([row[f"return_{side}"] for row in limits] for side in ("low", "high"))
+            axis.fill_between(
+                [row[what] for row in limits], low, high, color=shade, alpha=0.18, linewidth=0
+            )
+            shown += [low, high]
+    axis.set_xlabel(f"actuator {what} ({'action units' if what == 'bias' else 'factor'})")
+    axis.set_ylabel("return (sum of rewards)")
+    axis.grid(alpha=0.3)
+    return shown
+
+
+def _values(row: Row) -> list[float]:
+    return [float(value) for value in str(row["return_values"]).split()]

@@ -1,0 +1,106 @@
+"""The sections about evaluations of frozen policies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from torchrl_l1.report.evaluation_figures import plot_ablation, plot_disturbances
+from torchrl_l1.report.evaluation_tables import ablation_rows, evaluation_names, evaluation_rows
+from torchrl_l1.report.page import Page, slug
+from torchrl_l1.report.rendering import ablation_table, evaluation_table
+from torchrl_l1.report.settings import BASELINE
+from torchrl_l1.report.style import arm_label, noise_words, title
+from torchrl_l1.report.variants import Study
+
+__all__ = ["evaluation_sections"]
+
+Row = Mapping[str, Any]
+
+# Longer tables are left to their CSV.
+_MOST_ROWS = 160
+
+_ACTIONS = {"stochastic": "sampled actions", "deterministic": "mean action"}
+
+
+def evaluation_sections(page: Page, study: Study) -> None:
+    """A section per evaluation: those of the paper first, then the user's own."""
+    special: dict[str, Callable[[Page, Sequence[Row]], None]] = {
+        "sim_to_real": _sim_to_real,
+        "ablation": _ablation,
+        "disturbances": _disturbances,
+    }
+    for name in sorted(evaluation_names(study), key=lambda n: ([*special, n].index(n), n)):
+        rows = evaluation_rows(study, name)
+        if name == "ablation":
+            rows = ablation_rows(rows)
+        if rows:
+            special.get(name, _other(name))(page, rows)
+            page.csv(name, rows)
+
+
+def _sim_to_real(page: Page, rows: Sequence[Row]) -> None:
+    page.heading(
+        "Sim to real",
+        "Policies and models trained without noise, frozen and tested with it, L1 off and on "
+        "(the paper's Table 2): mean ± standard deviation over training seeds, 95 % interval of "
+        "the mean; differences are taken policy by policy.",
+    )
+    _evaluation_tables(page, rows)
+
+
+def _ablation(page: Page, rows: Sequence[Row]) -> None:
+    page.heading(
+        "Ablation",
+        "L1 in neither phase, in one of them, or in both (the paper's Table 5 and ablation "
+        "figure): bars are means, dots training seeds, lines 95 % intervals.",
+    )
+    for l1 in sorted({row["training_l1"] for row in rows} - {BASELINE}):
+        mine = [row for row in rows if {row["training_l1"], row["l1"]} <= {BASELINE, l1}]
+        for policy, actions in _ACTIONS.items():
+            chosen = [row for row in mine if row["policy"] == policy]
+            if chosen:
+                page.text(f"L1 {l1}, {actions}:", ablation_table(chosen))
+        for variant in dict.fromkeys(row["variant"] for row in mine):
+            chosen = [r for r in mine if (r["variant"], r["policy"]) == (variant, "stochastic")]
+            if chosen:
+                file = page.folder / f"ablation_{slug((l1, variant))}.png"
+                caption = ", ".join(filter(None, (f"Ablation, L1 {l1}", variant)))
+                page.figure(plot_ablation(chosen, file), caption)
+
+
+def _disturbances(page: Page, rows: Sequence[Row]) -> None:
+    page.heading(
+        "Disturbances",
+        "Return of frozen policies against an actuator bias and an actuator gain that the model "
+        "has never seen: mean over training seeds, with its 95 % interval as a band.",
+    )
+    cells = ("task", "training_noise", "training_l1", "variant")
+    for cell in dict.fromkeys(tuple(row[key] for key in cells) for row in rows):
+        chosen = [row for row in rows if tuple(row[key] for key in cells) == cell]
+        task, noise, l1, variant = cell
+        heading = f"{title(task)}: trained with {noise_words(noise)} and {arm_label(l1)}"
+        heading += f" ({variant})" * bool(variant)
+        file = page.folder / f"disturbances_{slug(cell)}.png"
+        page.figure(plot_disturbances(chosen, heading, file), heading)
+
+
+def _other(name: str) -> Callable[[Page, Sequence[Row]], None]:
+    def section(page: Page, rows: Sequence[Row]) -> None:
+        page.heading(
+            f"Evaluation `{name}`",
+            "Frozen policies under its conditions: mean ± standard deviation over training "
+            "seeds, 95 % interval of the mean; differences are taken policy by policy.",
+        )
+        _evaluation_tables(page, rows)
+
+    return section
+
+
+def _evaluation_tables(page: Page, rows: Sequence[Row]) -> None:
+    """A table per L1 setting of the training and kind of policy."""
+    for l1 in dict.fromkeys(row["training_l1"] for row in rows):
+        for policy, actions in _ACTIONS.items():
+            chosen = [r for r in rows if (r["training_l1"], r["policy"]) == (l1, policy)]
+            if chosen and len(chosen) <= _MOST_ROWS:
+                page.text(f"Trained with {arm_label(l1)}, {actions}:", evaluation_table(chosen))

@@ -1,0 +1,120 @@
+"""Evaluations of frozen policies over training seeds, as rows of values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from torchrl_l1.report.published import published_cell
+from torchrl_l1.report.runs import Evaluation, Run
+from torchrl_l1.report.settings import BASELINE
+from torchrl_l1.report.statistics import bootstrap_interval
+from torchrl_l1.report.training_tables import difference_summary
+from torchrl_l1.report.variants import Study, noise_order, variant_text
+
+__all__ = ["PHASES", "ablation_rows", "evaluation_names", "evaluation_rows"]
+
+PHASES = ("neither", "training only", "testing only", "both")
+"""Where L1 is on, in the order in which tables and figures show it."""
+
+_CONDITION = ("l1", "noise", "bias", "gain", "policy")
+
+
+def evaluation_names(study: Study) -> list[str]:
+    """Names of the evaluations that there are."""
+    return sorted({name for run in study.runs for name in run.evaluations})
+
+
+def evaluation_rows(study: Study, name: str) -> list[dict[str, Any]]:
+    """One row per cell of the training and condition of the test.
+
+    ``return_values`` holds the mean returns of the single training seeds, ``std`` is their
+    population standard deviation (as in the paper's tables), and the differences are those to
+    the same policies tested without L1. Runs that are not finished are left out.
+    """
+    rows = []
+    for cell, runs in study.cells.items():
+        done = [run for run in runs if run.finished and name in run.evaluations]
+        tests: dict[tuple[Any, ...], list[tuple[Run, Evaluation]]] = {}
+        for run in done:
+            for test in run.evaluations[name]:
+                key = tuple(getattr(test, field) for field in _CONDITION)
+                tests.setdefault(key, []).append((run, test))
+        for key in sorted(tests, key=_order):
+            rows.append(
+                {
+                    "task": cell.task,
+                    "training_noise": cell.noise,
+                    "training_l1": cell.arm,
+                    "variant": variant_text(cell.variant),
+                    **dict(zip(_CONDITION, key, strict=True)),
+                    **_summary(tests[key]),
+                    **_against_baseline(key, tests),
+                    **_published(runs[0], key),
+                }
+            )
+    return rows
+
+
+def ablation_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Those rows of an evaluation that the ablation is made of, with the ``phase`` of L1.
+
+    The test has the noise of the training, and L1 is on in both phases, in one, or in neither.
+    Where L1 is on in both it is the same L1.
+    """
+    chosen = []
+    for row in rows:
+        trained, tested = row["training_l1"], row["l1"]
+        on = {trained, tested} - {BASELINE}
+        if row["training_noise"] == row["noise"] and len(on) < 2:
+            chosen.append({**row, "phase": phase(trained, tested)})
+    return sorted(chosen, key=lambda row: PHASES.index(row["phase"]))
+
+
+def phase(trained: str, tested: str) -> str:
+    """Where L1 is on: ``neither``, ``training only``, ``testing only`` or ``both``."""
+    if trained == BASELINE:
+        return "neither" if tested == BASELINE else "testing only"
+    return "training only" if tested == BASELINE else "both"
+
+
+def _summary(tests: Sequence[tuple[Run, Evaluation]]) -> dict[str, Any]:
+    values = [test.return_mean for _, test in tests]
+    result: dict[str, Any] = {
+        "training_seeds": len(values),
+        "episodes_per_seed": " ".join(sorted({str(test.episodes) for _, test in tests})),
+        "return_mean": float(np.mean(values)),
+        "std": float(np.std(values)),
+        "return_values": " ".join(f"{value:.6g}" for value in values),
+    }
+    interval = bootstrap_interval(values)
+    if interval is not None:
+        result |= {"return_low": interval.low, "return_high": interval.high}
+    return result
+
+
+def _against_baseline(
+    key: tuple[Any, ...], tests: Mapping[tuple[Any, ...], Sequence[tuple[Run, Evaluation]]]
+) -> dict[str, Any]:
+    if key[0] == BASELINE:
+        return {}
+    without = {run.path: test.return_mean for run, test in tests.get((BASELINE, *key[1:]), ())}
+    return difference_summary(
+        [test.return_mean - without[run.path] for run, test in tests[key] if run.path in without]
+    )
+
+
+def _published(run: Run, key: tuple[Any, ...]) -> dict[str, str]:
+    l1, noise, bias, gain, policy = key
+    what = run.identity
+    if (bias, gain, policy) != (0.0, 1.0, "stochastic") or what.model_form == "affine":
+        return {}
+    cell = published_cell(what.task, what.noise, what.arm, noise, l1)
+    return {} if cell is None else cell.columns()
+
+
+def _order(key: tuple[Any, ...]) -> tuple[Any, ...]:
+    l1, noise, bias, gain, policy = key
+    return policy != "stochastic", noise_order(noise), bias, gain, l1 != BASELINE, l1

@@ -1,0 +1,91 @@
+"""The report itself: sections of text, tables and figures."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torchrl_l1.report.campaigns import CampaignState
+from torchrl_l1.report.runs import Run
+from torchrl_l1.report.tables import markdown, write_csv
+
+__all__ = ["Page", "slug"]
+
+Row = Mapping[str, Any]
+
+
+class Page:
+    """A Markdown page with its CSVs and figures in one folder.
+
+    Args:
+        folder: where everything goes; must exist.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._blocks: list[str] = ["# Report"]
+
+    def heading(self, text: str, how_to_read: str) -> None:
+        """Begin a section with a sentence on how to read it."""
+        self.text(f"## {text}")
+        self.text(how_to_read)
+
+    def text(self, *blocks: str) -> None:
+        """Add paragraphs or tables."""
+        self._blocks += [block for block in blocks if block]
+
+    def csv(self, name: str, rows: Sequence[Row]) -> None:
+        """Write a table in full precision and name it."""
+        file = self.folder / f"{name}.csv"
+        write_csv(file, rows)
+        self.text(f"All columns: [{file.name}]({file.name}).")
+
+    def figure(self, file: Path | None, caption: str) -> None:
+        """Show a figure; nothing if there was nothing to draw."""
+        if file is not None:
+            self.text(f"![{caption}]({file.name})")
+
+    def campaigns(self, campaigns: Sequence[CampaignState]) -> None:
+        """How far each campaign is, and the command behind it."""
+        for campaign in campaigns:
+            left = campaign.expected - campaign.finished - campaign.begun
+            state = f"{campaign.finished} of {campaign.expected} runs finished"
+            state += f", {campaign.begun} unfinished" * (campaign.begun > 0)
+            state += f", {left} not begun" * (left > 0)
+            self.text(
+                f"Campaign **{campaign.name}** ({state}). {campaign.description}".strip(),
+                f"```console\n$ {campaign.command}\n```",
+            )
+
+    def versions(self, runs: Sequence[Run]) -> None:
+        """What the runs ran with, a line per package and version."""
+        seen: dict[tuple[str, str], int] = {}
+        for run in runs:
+            for package, version in run.versions.items():
+                seen[package, version] = seen.get((package, version), 0) + 1
+        rows = [
+            {"package": package, "version": version, "runs": str(count)}
+            for (package, version), count in sorted(seen.items())
+        ]
+        without = sum(not run.versions for run in runs)
+        if rows:
+            self.text(markdown(rows))
+            self.csv("versions", rows)
+        if without:
+            self.text(f"{without} of {len(runs)} runs have no versions.json.")
+
+    def render(self) -> str:
+        """The Markdown."""
+        return "\n\n".join(self._blocks) + "\n"
+
+
+def slug(words: Sequence[str]) -> str:
+    """Words as part of a file name.
+
+    Examples:
+        >>> slug(["half_cheetah", "", "l1.epsilon=0.1"])
+        'half_cheetah_l1_epsilon_0_1'
+    """
+    return re.sub(r"[^A-Za-z0-9]+", "_", "_".join(filter(None, words))).strip("_").lower()

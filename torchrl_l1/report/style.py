@@ -1,0 +1,134 @@
+"""Colours, names and scales that all figures share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from torchrl_l1.report.settings import BASELINE
+
+__all__ = [
+    "arm_label",
+    "color",
+    "fit_scale",
+    "grid",
+    "legend_below",
+    "noise_words",
+    "save",
+    "title",
+]
+
+# Okabe and Ito: told apart with any colour vision. Grey is kept for the authors' curves.
+_ARMS = {"off": "#D55E00", "paper": "#0072B2", "reference": "#009E73", "slow": "#CC79A7"}
+_CYCLE = ("#D55E00", "#0072B2", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#000000")
+
+_NAMES = {
+    "inverted_pendulum": "Inverted pendulum",
+    "swimmer": "Swimmer",
+    "hopper": "Hopper",
+    "walker": "Walker",
+    "half_cheetah": "HalfCheetah",
+}
+_NOISES = {
+    "none": "no noise",
+    "action": "action noise",
+    "observation": "observation noise",
+    "both": "action and observation noise",
+}
+
+
+def color(index: int, arm: str | None = None) -> str:
+    """Colour of an arm, or of the n-th of several lines."""
+    return _ARMS.get(arm or "", _CYCLE[index % len(_CYCLE)])
+
+
+def arm_label(arm: str) -> str:
+    """An arm's name in a legend."""
+    return "L1 off" if arm == BASELINE else f"L1 {arm}"
+
+
+def title(task: str, noise: str | None = None) -> str:
+    """A task's name in headings, with its noise."""
+    name = _NAMES.get(task, task)
+    return name if noise is None else f"{name}, {noise_words(noise)}"
+
+
+def noise_words(noise: str) -> str:
+    """A noise setting in headings."""
+    return _NOISES.get(noise, f"noise {noise}")
+
+
+def grid(panels: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure with so many panels, in rows of at most ``columns``; sizes in inches."""
+    columns = min(panels, columns)
+    rows = -(-panels // columns)
+    figure, axes = plt.subplots(
+        rows,
+        columns,
+        # A single panel still has to carry a legend of some width.
+        figsize=(max(width * columns, 6.4), height * rows),
+        squeeze=False,
+        constrained_layout=True,
+    )
+    flat = list(axes.flat)
+    for empty in flat[panels:]:
+        empty.set_visible(False)
+    return figure, flat[:panels]
+
+
+def fit_scale(axes: Sequence[Axes], values: Iterable[np.ndarray | Sequence[float]]) -> None:
+    """A symmetric logarithmic scale where returns lie between 0 and far below.
+
+    On the pendulum -100 is a fallen pole, -1 a poor and -0.01 a good controller.
+    """
+    every = np.concatenate([np.asarray(list(value), dtype=float) for value in values])
+    if every.size and every.max() <= 0 and every.max() > -0.5 and every.min() < -5:
+        ticks = [0.0] + [-(10.0**k) for k in range(-1, 7) if 10.0**k < -3 * every.min()]
+        for axis in axes:
+            axis.set_yscale("symlog", linthresh=0.1, linscale=0.5)
+            axis.set_yticks(ticks)
+            # The margins would otherwise be those of the linear scale.
+            axis.set_ylim(1.6 * every.min(), 0.03)
+
+
+def legend_below(figure: Figure, axes: Sequence[Axes], last: Sequence[str] = ()) -> None:
+    """One legend for all panels, under them; equal entries appear once.
+
+    Args:
+        figure: the figure.
+        axes: its panels.
+        last: beginnings of labels that come at the end.
+    """
+    entries: dict[str, Artist] = {}
+    for axis in axes:
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    labels = sorted(entries, key=lambda label: label.startswith(tuple(last)))
+    # Inches that an entry takes at this size of letters.
+    width = 0.075 * max(map(len, labels), default=0) + 0.6
+    fitting = max(1, int(figure.get_figwidth() / width))
+    rows = -(-len(labels) // fitting)
+    figure.legend(
+        [entries[label] for label in labels],
+        labels,
+        loc="outside lower center",
+        ncols=-(-len(labels) // max(rows, 1)),
+        frameon=False,
+        fontsize=9,
+    )
+
+
+def save(figure: Figure, file: Path) -> Path:
+    """Write a figure and close it."""
+    figure.savefig(file, dpi=130)
+    plt.close(figure)
+    return file

@@ -1,0 +1,111 @@
+"""The sections about training: table, paired differences, learning curves, comparisons."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from torchrl_l1.report.learning_curves import plot_comparison, plot_task
+from torchrl_l1.report.page import Page, slug
+from torchrl_l1.report.reference_curves import ReferenceCurves
+from torchrl_l1.report.rendering import paired_table, training_table
+from torchrl_l1.report.style import title
+from torchrl_l1.report.training_tables import paired_rows, training_row
+from torchrl_l1.report.variants import Study, variant_text
+
+__all__ = ["training_sections"]
+
+Row = Mapping[str, Any]
+
+
+def training_sections(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
+    """Everything that is known from the runs' own returns."""
+    _training(page, study, reference)
+    _pairs(page, study)
+    _curves(page, study, reference)
+    _comparisons(page, study, reference)
+
+
+def _training(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
+    rows = {cell: training_row(cell, runs, reference) for cell, runs in study.cells.items()}
+    page.heading(
+        "Training",
+        "Return is the mean over seeds of the mean over the last three outer iterations, of "
+        "sampled actions as in the paper; the spread is the paper's ± (standard deviation over "
+        "seeds in each of these iterations, averaged), the interval a bootstrap of the mean over "
+        "seeds.",
+    )
+    page.text(training_table([row for cell, row in rows.items() if not cell.variant]))
+    page.text(_main_settings(study))
+    page.csv("training", list(rows.values()))
+
+
+def _main_settings(study: Study) -> str:
+    lines = []
+    for task in study.tasks():
+        cells = [cell for cell in study.cells if cell.task == task and not cell.variant]
+        settings: dict[str, None] = {}
+        for cell in cells:
+            shared = study.main_settings(task)
+            for key, value in study.main_settings(task, cell.arm).items():
+                where = "" if key in shared else f" (L1 {cell.arm})"
+                settings[f"`{key}={value}`{where}"] = None
+        if settings:
+            lines.append(f"- {task}: {', '.join(settings)}")
+    if not lines:
+        return ""
+    return "Runs with other settings than these have tables of their own:\n\n" + "\n".join(lines)
+
+
+def _pairs(page: Page, study: Study) -> None:
+    rows = paired_rows(study)
+    if not rows:
+        return
+    page.heading(
+        "L1 less baseline",
+        "Differences of the same return between runs of the same seed and settings with and "
+        "without L1: an interval that holds 0 shows no clear effect; fewer than three pairs are "
+        "shown as they are.",
+    )
+    page.text(paired_table(rows))
+    page.csv("pairs", rows)
+
+
+def _curves(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
+    page.heading(
+        "Learning curves",
+        "Thin: single seeds; bold: their mean; dashed: mean of the return with the mean action; "
+        "grey: mean of the authors' logs, where they were given, cut where ours end.",
+    )
+    for task in study.tasks():
+        file = plot_task(study, task, page.folder / f"learning_curves_{task}.png", reference)
+        page.figure(file, f"Learning curves, {title(task)}")
+
+
+def _comparisons(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
+    for keys in study.comparisons():
+        cells = study.compared(keys)
+        texts = {variant_text(c.variant): study.describe(c, keys) for c in cells if c.variant}
+        main = {(c.task, c.noise, c.arm): study.describe(c, keys) for c in cells if not c.variant}
+
+        def variant(
+            row: Row,
+            texts: Mapping[str, str] = texts,
+            main: Mapping[tuple[str, str, str], str] = main,
+        ) -> str:
+            own = texts.get(row["variant"])
+            return main[row["task"], row["noise"], row["l1"]] if own is None else own
+
+        page.heading(
+            f"By {' and '.join(f'`{key}`' for key in keys)}",
+            "The same table for runs that depart from the main ones in these settings, and the "
+            "main ones of the same task and noise."
+            + " It is the comparison of the paper's Figure 2."
+            * ("model.form" in keys),
+        )
+        rows = [training_row(cell, study.cells[cell], reference) for cell in cells]
+        page.text(training_table(rows, variant))
+        for task in dict.fromkeys(cell.task for cell in cells):
+            name = page.folder / f"by_{slug(keys)}_{task}.png"
+            figure = plot_comparison(study, task, keys, name, reference)
+            page.figure(figure, f"Learning curves by {', '.join(keys)}, {title(task)}")

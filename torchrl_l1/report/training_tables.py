@@ -1,0 +1,143 @@
+"""The training table (the paper's Table 1) and the paired differences, as rows of values."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from torchrl_l1.report.published import published_cell
+from torchrl_l1.report.reference_curves import ReferenceCurves
+from torchrl_l1.report.runs import Run
+from torchrl_l1.report.settings import BASELINE
+from torchrl_l1.report.statistics import (
+    bootstrap_interval,
+    final_return,
+    interquartile_mean,
+    published_spread,
+)
+from torchrl_l1.report.variants import Cell, Study, variant_text
+
+__all__ = ["paired_rows", "run_rows", "training_row"]
+
+
+def run_rows(study: Study) -> list[dict[str, Any]]:
+    """One row per run, unfinished ones included."""
+    return [
+        {
+            **_place(cell),
+            "seed": run.identity.seed,
+            "iterations": len(run.returns),
+            "of": run.identity.outer_iterations,
+            "real_steps": int(run.real_steps[-1]) if len(run.real_steps) else 0,
+            "return": run.final if run.finished else None,
+            "return_deterministic": run.final_deterministic if run.finished else None,
+            "path": str(run.path),
+        }
+        for cell, runs in study.cells.items()
+        for run in runs
+    ]
+
+
+def training_row(
+    cell: Cell, runs: Sequence[Run], reference: ReferenceCurves | None = None
+) -> dict[str, Any]:
+    """A cell: our returns over its finished runs, the paper's, the authors' logged ones.
+
+    The return is the mean over seeds of the mean over the last three outer iterations.
+    """
+    done = [run for run in runs if run.finished]
+    place = (cell.task, cell.noise, cell.arm)
+    row: dict[str, Any] = {**_place(cell), "seeds": len(done)}
+    if done:
+        row |= _summary("return", [run.final for run in done])
+        if len(done) > 1:
+            row["published_spread"] = published_spread(np.array([run.returns for run in done]))
+        row |= _summary("deterministic", [run.final_deterministic for run in done])
+        row["real_steps"] = round(float(np.mean([run.real_steps[-1] for run in done])))
+    row["unfinished"] = "; ".join(
+        f"seed {run.identity.seed}: {run.progress} iterations" for run in runs if not run.finished
+    )
+    affine = runs[0].identity.model_form == "affine"
+    # The paper prints no returns with control-affine models; their curves are in its Figure 2.
+    published = None if affine else published_cell(*place, *place[1:])
+    if published is not None:
+        row |= published.columns()
+    curves = None
+    if reference is not None and affine and cell.noise == "none" and cell.arm == BASELINE:
+        curves = reference.model_form(cell.task, "affine")
+    elif reference is not None and published is not None:
+        curves = reference.training(*place)
+    if curves is not None:
+        row |= {
+            "authors_mean": float(final_return(curves.returns).mean()),
+            "authors_spread": published_spread(curves.returns),
+            "authors_seeds": len(curves.returns),
+        }
+    return row
+
+
+def paired_rows(study: Study) -> list[dict[str, Any]]:
+    """L1 less the baseline over the seeds that both have, by stochastic and mean actions."""
+    rows = []
+    for cell, runs in study.cells.items():
+        if cell.arm == BASELINE:
+            continue
+        pairs, single = [], []
+        for run in runs:
+            baseline = study.baseline_of(run)
+            if run.finished and baseline is not None and baseline.finished:
+                pairs.append((run, baseline))
+            else:
+                single.append(str(run.identity.seed))
+        for policy in ("stochastic", "deterministic"):
+            finals = [
+                (l1.final, off.final)
+                if policy == "stochastic"
+                else (l1.final_deterministic, off.final_deterministic)
+                for l1, off in pairs
+            ]
+            differences = [ours - base for ours, base in finals]
+            rows.append(
+                {
+                    **_place(cell),
+                    "policy": policy,
+                    "pairs": len(pairs),
+                    "seeds": " ".join(str(run.identity.seed) for run, _ in pairs),
+                    **difference_summary(differences),
+                    "without_pair": " ".join(single),
+                }
+            )
+    return rows
+
+
+def difference_summary(differences: Sequence[float]) -> dict[str, Any]:
+    """Mean and interquartile mean with intervals; the differences themselves if they are few."""
+    if not differences:
+        return {}
+    result = _summary("difference", differences)
+    result["iqm"] = float(interquartile_mean(differences))
+    interval = bootstrap_interval(differences, interquartile=True)
+    if interval is not None:
+        result |= {"iqm_low": interval.low, "iqm_high": interval.high}
+    result["differences"] = " ".join(f"{value:.6g}" for value in differences)
+    return result
+
+
+def _summary(name: str, values: Sequence[float]) -> dict[str, Any]:
+    """Mean and, of three values or more, its interval."""
+    result = {f"{name}_mean": float(np.mean(values))}
+    interval = bootstrap_interval(values)
+    if interval is not None:
+        result |= {f"{name}_low": interval.low, f"{name}_high": interval.high}
+    return result
+
+
+def _place(cell: Cell) -> dict[str, Any]:
+    return {
+        "task": cell.task,
+        "noise": cell.noise,
+        "l1": cell.arm,
+        "variant": variant_text(cell.variant),
+    }

@@ -1,0 +1,173 @@
+"""Which runs are samples of the same thing, and what sets the others apart."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from torchrl_l1.report.runs import Run
+from torchrl_l1.report.settings import BASELINE, NOISES, TASKS, default_text
+
+__all__ = ["Cell", "Study", "variant_text"]
+
+Deviations = tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Runs that differ in nothing but their seed.
+
+    Attributes:
+        task: the task.
+        noise: noise of the training.
+        arm: ``off`` or the L1 setting of the training.
+        variant: settings in which it departs from the main cells of the task, with values.
+    """
+
+    task: str
+    noise: str
+    arm: str
+    variant: Deviations = ()
+
+
+def variant_text(variant: Deviations) -> str:
+    """A variant in words, such as ``label=nominal``; empty for the main one."""
+    return ", ".join(f"{key}={value}" for key, value in variant)
+
+
+class Study:
+    """Runs by cell.
+
+    The settings of a task that most of its combinations of noise and arm were run with are its
+    main ones; what departs from them is a variant and is never pooled with them. Settings of
+    the controller are compared among the runs of one arm.
+
+    Args:
+        runs: the runs, in any order. Of those with equal settings and seed the one that is
+            furthest stays, and the others go to :attr:`duplicates`.
+    """
+
+    def __init__(self, runs: Sequence[Run]) -> None:
+        self.duplicates: list[Run] = []
+        unique: dict[tuple[object, ...], Run] = {}
+        for run in runs:
+            key = (*_pairing_key(run), run.identity.arm, _frozen(run.identity.l1))
+            best = unique.setdefault(key, run)
+            if best is not run:
+                better, worse = (run, best) if len(run.returns) > len(best.returns) else (best, run)
+                unique[key] = better
+                self.duplicates.append(worse)
+        self.runs = list(unique.values())
+        self._main: dict[tuple[str, str], dict[str, str]] = {}
+        for task in {run.identity.task for run in self.runs}:
+            members = [run for run in self.runs if run.identity.task == task]
+            self._main[task, ""] = _main_settings(members, [r.identity.shared for r in members])
+            for arm in {run.identity.arm for run in members}:
+                same = [run for run in members if run.identity.arm == arm]
+                self._main[task, arm] = _main_settings(same, [r.identity.l1 for r in same])
+        self.cells: dict[Cell, list[Run]] = {}
+        for run in sorted(self.runs, key=lambda run: run.identity.seed):
+            self.cells.setdefault(self.cell(run), []).append(run)
+        self.cells = dict(sorted(self.cells.items(), key=lambda item: _order(item[0])))
+
+    def cell(self, run: Run) -> Cell:
+        """The cell of a run."""
+        what = run.identity
+        settings = {**what.shared, **what.l1}
+        main = self.main_settings(what.task, what.arm)
+        variant = tuple((k, settings.get(k, "(absent)")) for k in main)
+        departing = tuple((k, v) for k, v in variant if v != main[k])
+        return Cell(what.task, what.noise, what.arm, departing)
+
+    def main_settings(self, task: str, arm: str = BASELINE) -> dict[str, str]:
+        """Values of the main cells, of those settings that differ between runs."""
+        return {**self._main[task, ""], **self._main.get((task, arm), {})}
+
+    def tasks(self) -> list[str]:
+        """Tasks in the paper's order."""
+        return list(dict.fromkeys(cell.task for cell in self.cells))
+
+    def comparisons(self) -> list[tuple[str, ...]]:
+        """Sets of settings that cells depart in, none part of another: a comparison for each."""
+        sets = {frozenset(key for key, _ in cell.variant) for cell in self.cells if cell.variant}
+        largest = [one for one in sets if not any(one < other for other in sets)]
+        return sorted(tuple(sorted(one)) for one in largest)
+
+    def compared(self, keys: Sequence[str]) -> list[Cell]:
+        """Cells that depart in these settings alone, and the main cells to hold them against."""
+
+        def departs(cell: Cell) -> bool:
+            return bool(cell.variant) and {key for key, _ in cell.variant} <= set(keys)
+
+        places = {(cell.task, cell.noise) for cell in self.cells if departs(cell)}
+        return [
+            cell
+            for cell in self.cells
+            if departs(cell) or (not cell.variant and (cell.task, cell.noise) in places)
+        ]
+
+    def describe(self, cell: Cell, keys: Sequence[str]) -> str:
+        """Values of some settings in a cell: those of the main cells unless it departs."""
+        values = {**self.main_settings(cell.task, cell.arm), **dict(cell.variant)}
+        return variant_text(tuple((key, values[key]) for key in keys if key in values))
+
+    def baseline_of(self, run: Run) -> Run | None:
+        """The run without L1 of the same task, noise, seed and settings."""
+        for other in self.runs:
+            if other.identity.arm == BASELINE and _pairing_key(other) == _pairing_key(run):
+                return other
+        return None
+
+
+def _pairing_key(run: Run) -> tuple[object, ...]:
+    what = run.identity
+    return what.task, what.noise, what.seed, _frozen(what.shared)
+
+
+def _frozen(settings: Mapping[str, str]) -> frozenset[tuple[str, str]]:
+    return frozenset(settings.items())
+
+
+def _main_settings(runs: Sequence[Run], settings: Sequence[Mapping[str, str]]) -> dict[str, str]:
+    """Of the settings that differ, the combination that covers most of a task."""
+    every = dict.fromkeys(key for one in settings for key in one)
+    keys = [key for key in every if len({one.get(key, "(absent)") for one in settings}) > 1]
+    combinations = [tuple(one.get(key, "(absent)") for key in keys) for one in settings]
+    numbers = Counter(combinations)
+    places = Counter(
+        combination
+        for combination, _, _ in {
+            (combination, run.identity.noise, run.identity.arm)
+            for combination, run in zip(combinations, runs, strict=True)
+        }
+    )
+
+    def rank(combination: tuple[str, ...]) -> tuple[object, ...]:
+        defaults = sum(default_text(k) == v for k, v in zip(keys, combination, strict=True))
+        return -places[combination], -numbers[combination], -defaults, combination
+
+    best = min(numbers, key=rank)
+    return dict(zip(keys, best, strict=True))
+
+
+def noise_order(noise: str) -> tuple[int, str]:
+    """Sort key: the paper's order, then the alphabet."""
+    return _place(NOISES, noise)
+
+
+def _order(cell: Cell) -> tuple[object, ...]:
+    task, noise = _place(TASKS, cell.task), noise_order(cell.noise)
+    variant = tuple((key, _number_first(value)) for key, value in cell.variant)
+    return task, noise, cell.arm != BASELINE, cell.arm, len(variant), variant
+
+
+def _number_first(value: str) -> tuple[bool, float, str]:
+    try:
+        return False, float(value), value
+    except ValueError:
+        return True, 0.0, value
+
+
+def _place(names: Sequence[str], name: str) -> tuple[int, str]:
+    return (names.index(name) if name in names else len(names), name)
