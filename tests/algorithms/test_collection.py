@@ -3,8 +3,14 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict
 
-from torchrl_l1.algorithms.collection import Collection, Perturbation, episode_returns
+from torchrl_l1.algorithms.collection import (
+    Collection,
+    Perturbation,
+    episode_returns,
+    first_episodes,
+)
 from torchrl_l1.algorithms.policy import GaussianPolicy, acting
+from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.envs import get_task
 
@@ -15,6 +21,7 @@ def test_returns_are_those_of_first_episodes() -> None:
     following = {"done": done, "episode_reward": reward}
     data = TensorDict({"next": following}, batch_size=[2, 4])
     assert episode_returns(data).tolist() == [2.0, 4.0]
+    assert first_episodes(data)["next", "episode_reward"].flatten().tolist() == [1, 2, 1, 2, 3, 4]
 
 
 def test_episodes_that_end_early_are_followed_by_others() -> None:
@@ -34,3 +41,18 @@ def test_episodes_that_end_early_are_followed_by_others() -> None:
         torch.testing.assert_close(episode_returns(data)[row], total)
         # The step after a fall shows a walker that stands.
         assert data["observation"][row, length, 0] > 1.2
+
+
+def test_evaluation_ends_with_the_last_episode() -> None:
+    task = get_task("walker")
+    torch.manual_seed(0)
+    policy = GaussianPolicy(task.observation_dim, task.action_dim, [8])
+    model = EnsembleDynamics(task.observation_dim, task.action_dim, members=2, hidden=(8,))
+    l1 = L1Config.paper(task.dt, epsilon=0.3, action_low=-1.0, action_high=1.0)
+    collection = Collection(task, 4, acting(policy, task), model, l1, Perturbation())
+    data = collection.evaluate(0, deterministic=False)
+    lengths = [int(row.nonzero()[0]) + 1 for row in data["next", "done"].squeeze(-1)]
+    assert data.shape == (4, max(lengths)) and min(lengths) < max(lengths) < 200
+    assert len(first_episodes(data)) == sum(lengths)
+    returns = [data["next", "reward"][i, :length].sum() for i, length in enumerate(lengths)]
+    torch.testing.assert_close(episode_returns(data), torch.stack(returns))

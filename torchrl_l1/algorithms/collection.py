@@ -140,7 +140,8 @@ class Collection:
     ) -> TensorDictBase:
         """As many extra episodes ``[N, T]``, of the policy's mean or sampled actions.
 
-        Each environment's first episode is whole, see :func:`episode_returns`.
+        One episode per environment; the rows of those that end early repeat their last step, see
+        :func:`first_episodes`.
 
         ``callback`` is called after every step with the environment and the data so far.
         """
@@ -148,7 +149,11 @@ class Collection:
         kind = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
         with torch.no_grad(), set_exploration_type(kind):
             return self.env.rollout(
-                steps or self.horizon, self.policy, callback=callback, break_when_any_done=False
+                steps or self.horizon,
+                self.policy,
+                callback=callback,
+                break_when_any_done=False,
+                break_when_all_done=True,
             )
 
 
@@ -181,12 +186,18 @@ def signal_metrics(data: TensorDictBase) -> dict[str, float]:
 def episode_returns(data: TensorDictBase) -> Tensor:
     """Undiscounted return of the first episode of every environment in ``[N, T]``: ``(N,)``.
 
-    Where episodes end early, others follow in the same row. They are no fair sample: those that
+    Where episodes end early, others may follow in the same row. They are no fair sample: those that
     the end of the data cuts off are the long ones.
     """
     done = data["next", "done"].squeeze(-1)
     first = done & (done.cumsum(1) == 1)
     return data["next", "episode_reward"].squeeze(-1)[first]
+
+
+def first_episodes(data: TensorDictBase) -> TensorDictBase:
+    """The steps of the first episode of every environment in ``[N, T]``, in one row."""
+    done = data["next", "done"].squeeze(-1)
+    return data[done.cumsum(1) - done.long() == 0]
 
 
 def _with_executed(data: TensorDictBase) -> TensorDictBase:

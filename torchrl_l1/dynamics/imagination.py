@@ -52,10 +52,12 @@ def imagine(
         actions[t] = action = policy(observation)
         clipped = action.clamp(action_low, action_high)
         successor = observation + dynamics.member_change(observation, clipped, member)
-        rewards[t] = reward(observation, clipped, successor)
         inside[t] = within = dynamics.box.contains(successor)
-        # A trajectory that left stays where it last was inside, so that nothing overflows.
-        observation = torch.where(within[:, None], successor, observation)
+        # A trajectory that left stays where it last was inside, so that nothing overflows, and is
+        # rewarded for that: outside, neither state nor reward mean anything.
+        successor = torch.where(within[:, None], successor, observation)
+        rewards[t] = reward(observation, clipped, successor)
+        observation = successor
         observations[t + 1] = observation
     outside = (~inside).long()
     valid = (outside.cumsum(0) - outside) == 0
