@@ -10,15 +10,16 @@ GAMMA, LAMBDA = 0.9, 0.8
 
 
 def trajectories() -> TensorDict:
-    """Two trajectories of five steps; the second leaves the box in its third."""
+    """Three of five steps; the second leaves the box in its third, the third ends in its second."""
     torch.manual_seed(0)
-    left = torch.zeros(2, 5, 1, dtype=torch.bool)
-    left[1, 2] = True
-    done = left.clone()
+    left, fell = torch.zeros(2, 3, 5, 1, dtype=torch.bool)
+    left[1, 2] = fell[2, 1] = True
+    done = left | fell
     done[:, -1] = True
+    following = {"done": done, "left_box": left, "terminated": fell}
     return TensorDict(
-        {"next": {"reward": torch.randn(2, 5, 1), "done": done, "terminated": left}},
-        batch_size=[2, 5],
+        {"next": {"reward": torch.randn(3, 5, 1), **following}},
+        batch_size=[3, 5],
     )
 
 
@@ -35,9 +36,9 @@ def loop(rewards: list[float], values: list[float], last_value: float) -> list[f
 @pytest.mark.parametrize("box_exit", ["truncate", "fail"])
 def test_advantages_follow_the_definition(box_exit: str) -> None:
     data = trajectories()
-    value = torch.randn(2, 5, 1)
+    value = torch.randn(3, 5, 1)
     value[1, 3] = value[1, 2]  # after an exit the observation stays
-    last_value = torch.tensor([0.7, -0.4]).reshape(2, 1, 1)
+    last_value = torch.tensor([0.7, -0.4, 0.9]).reshape(3, 1, 1)
     advantage, target = imagined_advantages(data, value, last_value, GAMMA, LAMBDA, box_exit)
     rewards, values = data["next", "reward"][..., 0].tolist(), value[..., 0].tolist()
     whole = loop(rewards[0], values[0], last_value=0.7)
@@ -45,4 +46,6 @@ def test_advantages_follow_the_definition(box_exit: str) -> None:
     beyond = values[1][2] if box_exit == "truncate" else 0.0
     until_exit = loop(rewards[1][:3], values[1][:3], last_value=beyond)
     torch.testing.assert_close(advantage[1, :3, 0], torch.tensor(until_exit))
+    until_fall = loop(rewards[2][:2], values[2][:2], last_value=0.0)
+    torch.testing.assert_close(advantage[2, :2, 0], torch.tensor(until_fall))
     torch.testing.assert_close(target, advantage + value)

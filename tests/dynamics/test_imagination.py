@@ -57,8 +57,27 @@ def test_trajectories_end_where_they_leave_the_box() -> None:
         [True, True, True, False],
         [True, False, False, False],
     ]
-    assert trajectories["next", "terminated"][0, :3, 0].tolist() == [False, False, True]
+    assert trajectories["next", "left_box"][0, :3, 0].tolist() == [False, False, True]
+    assert not trajectories["next", "terminated"].any()
     assert trajectories["observation"].abs().max() <= 2.5
+
+
+def test_trajectories_end_where_the_task_does() -> None:
+    trajectories = imagine(
+        drifting_model(2.5),
+        lambda x: torch.ones(2, 1),
+        reward,
+        torch.tensor([[0.0, 0.0], [-2.4, 0.0]]),
+        4,
+        LOW,
+        HIGH,
+        lambda successor: successor[:, 0] >= 2,
+    )
+    # The first ends at 2, before it could leave the box; the second gets to 1.6.
+    assert trajectories["valid"][..., 0].int().tolist() == [[1, 1, 0, 0], [1, 1, 1, 1]]
+    assert trajectories["next", "terminated"][0, :2, 0].tolist() == [False, True]
+    assert trajectories["next", "done"][0, :2, 0].tolist() == [False, True]
+    assert not trajectories["next", "left_box"].any()
 
 
 def test_model_as_environment() -> None:

@@ -20,7 +20,7 @@ def imagined_advantages(
 
     What follows an exit from the data's box is unknown. To call it zero (``box_exit="fail"``)
     rewards leaving wherever rewards are negative; ``"truncate"`` lets the value of the last state
-    inside stand for it.
+    inside stand for it. Nothing follows where the task itself ends.
 
     Args:
         trajectories: from :func:`~torchrl_l1.dynamics.imagine`, batch size ``[B, T]``.
@@ -34,9 +34,9 @@ def imagined_advantages(
         advantages and value targets ``(B, T, 1)``; they mean nothing where ``valid`` is false.
     """
     done = trajectories["next", "done"]
-    terminated = torch.zeros_like(done)
+    terminated = trajectories["next", "terminated"]
     if box_exit == "fail":
-        terminated = terminated | trajectories["next", "terminated"]
+        terminated = terminated | trajectories["next", "left_box"]
     # After an exit the observation stays that of the last state inside, and so does its value.
     next_value = torch.cat([value[:, 1:], last_value], dim=1)
     advantage, target = generalized_advantage_estimate(

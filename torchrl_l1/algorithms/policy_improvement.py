@@ -52,6 +52,7 @@ class PolicyImprovement:
             config.imagined_horizon,
             self.action_low,
             self.action_high,
+            self.task.terminated if config.imagined_termination else None,
         )
         observation, step = trajectories["observation"], trajectories["step"]
         if config.bootstrap:
@@ -80,7 +81,7 @@ class PolicyImprovement:
         return PolicyStep(
             report,
             imagined_return=rewards.sum(1).mean().item(),
-            left_box=trajectories["next", "terminated"].any(1).float().mean().item(),
+            left_box=trajectories["next", "left_box"].any(1).float().mean().item(),
         )
 
     def starts(self, count: int, buffer: ReplayBuffer) -> Tensor:

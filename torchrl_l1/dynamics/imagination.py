@@ -20,6 +20,7 @@ def imagine(
     horizon: int,
     action_low: Tensor,
     action_high: Tensor,
+    terminated: Callable[[Tensor], Tensor] | None = None,
 ) -> TensorDict:
     """Roll a policy out in the ensemble, one random member per step for the whole batch.
 
@@ -35,11 +36,14 @@ def imagine(
         horizon: number of steps, T.
         action_low: lower bounds ``(m,)``.
         action_high: upper bounds ``(m,)``.
+        terminated: whether the task ends in a next observation, ``(B, n)`` to ``(B,)``; by
+            default it never does.
 
     Returns:
         trajectories of batch size ``[B, T]`` with ``observation``, ``action``, ``step``
-        ``(B, T, 1)``, ``valid`` ``(B, T, 1)`` (still inside the box when the step was taken)
-        and ``next``: ``observation``, ``reward``, ``done``, ``terminated``.
+        ``(B, T, 1)``, ``valid`` ``(B, T, 1)`` (not ended before the step) and ``next``:
+        ``observation``, ``reward``, ``done``, ``left_box`` and ``terminated``. What follows a
+        step that is ``done`` is not valid and means nothing.
     """
     batch, device = start.shape[0], start.device
     members = torch.randint(dynamics.members, (horizon,)).tolist()
@@ -47,6 +51,7 @@ def imagine(
     actions = start.new_empty(horizon, batch, action_low.shape[-1])
     rewards = start.new_empty(horizon, batch)
     inside = torch.empty(horizon, batch, dtype=torch.bool, device=device)
+    fallen = torch.zeros_like(inside)
     observations[0] = observation = start
     for t, member in enumerate(members):
         actions[t] = action = policy(observation)
@@ -57,12 +62,14 @@ def imagine(
         # rewarded for that: outside, neither state nor reward mean anything.
         successor = torch.where(within[:, None], successor, observation)
         rewards[t] = reward(observation, clipped, successor)
+        if terminated is not None:
+            fallen[t] = terminated(successor)
         observation = successor
         observations[t + 1] = observation
-    outside = (~inside).long()
-    valid = (outside.cumsum(0) - outside) == 0
-    left = valid & ~inside
-    done = left.clone()
+    ended = (~inside | fallen).long()
+    valid = (ended.cumsum(0) - ended) == 0
+    done = valid & ended.bool()
+    left, fell = done & ~inside, done & inside
     done[-1] = True
     columns = {
         "observation": observations[:-1],
@@ -73,7 +80,8 @@ def imagine(
             "observation": observations[1:],
             "reward": rewards[..., None],
             "done": done[..., None],
-            "terminated": left[..., None],
+            "left_box": left[..., None],
+            "terminated": fell[..., None],
         },
     }
     return TensorDict(columns, batch_size=[horizon, batch]).transpose(0, 1)
