@@ -7,7 +7,16 @@ import pkgutil
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("control", "dynamics", "envs", "objectives", "algorithms", "experiment", "campaign", "report")
+PACKAGES = (
+    "control",
+    "dynamics",
+    "envs",
+    "objectives",
+    "algorithms",
+    "experiment",
+    "campaign",
+    "report",
+)
 
 
 def metrics_table() -> str:

@@ -91,11 +91,7 @@ def _campaign_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
     add("--output", help="folder of all runs; runs/campaigns/NAME by default")
     add("--workers", type=int, help="runs at a time; as many as there are cores by default")
     add("--list", action="store_true", help="show the runs and how far they are, start nothing")
-    add(
-        "--launcher",
-        choices=["joblib", "submitit_slurm", "submitit_local", "ray", "basic"],
-        help="hand the runs to a Hydra launcher",
-    )
+    add("--launcher", help="hand the runs to one of Hydra's launchers, such as joblib")
 
 
 def _evaluate_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

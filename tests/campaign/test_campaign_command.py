@@ -11,21 +11,22 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
 
+from torchrl_l1.campaign import child, jobs, progress
 from torchrl_l1.campaign.description import read_campaign
 from torchrl_l1.campaign.launcher import sweep
 from torchrl_l1.campaign.plan import plan
 from torchrl_l1.campaign.progress import overview
 from torchrl_l1.campaign.runs import PlannedRun
-from torchrl_l1.campaign.yaml_file import dump_yaml
+from torchrl_l1.campaign.yaml_file import dump_yaml, load_yaml
 from torchrl_l1.cli import main
-from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.run_directory import RunDirectory
+from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
 
 PENDULUM = "metrpo/inverted_pendulum"
 
@@ -41,14 +42,20 @@ def campaign_file(tmp_path: Path, tiny_overrides: list[str]) -> Path:
 
 def edit(file: Path, **entries: Any) -> None:
     content: dict[str, Any] = OmegaConf.to_container(OmegaConf.load(file))
-    matrix = entries.pop("matrix", None)
-    if matrix is not None:
-        content["runs"][0]["matrix"] = matrix
+    for key in ("recipe", "matrix"):
+        if key in entries:
+            content["runs"][0][key] = entries.pop(key)
     file.write_text(dump_yaml(content | entries))
 
 
 def planned(file: Path, output: Path, *overrides: str) -> list[PlannedRun]:
     return plan(read_campaign(str(file), overrides), output)
+
+
+def train(this: PlannedRun, folder: Path | None = None, **settings: Any) -> None:
+    config = OmegaConf.merge(this.config, settings)
+    config.run_dir = str(folder or this.directory.path)
+    run(config)
 
 
 def command(file: Path, output: Path, *more: str) -> list[str]:
@@ -91,7 +98,7 @@ def test_killed_campaign_loses_at_most_the_running_iterations(campaign_file: Pat
         kept = before[this.directory.path]
         assert timings(this)[: len(kept)] == kept
         unbroken = campaign_file.parent / f"unbroken_{seed}"
-        run(compose(PENDULUM, [*this.overrides, f"run_dir={unbroken}"]))
+        train(this, unbroken)
         assert this.directory.metrics_file.read_text() == (unbroken / "metrics.csv").read_text()
 
 
@@ -114,9 +121,7 @@ def test_skips_finishes_evaluates_and_goes_on_past_a_failure(
     evaluation |= {"policy": ["deterministic"], "where": {"seed": [2]}}
     edit(campaign_file, matrix={"seed": [0, 1, 2]}, evaluations=[evaluation])
     done, blocked, fresh = planned(campaign_file, output)
-    run(compose(PENDULUM, [*done.overrides, f"run_dir={campaign_file.parent / 'done'}"]))
-    done.directory.path.parent.mkdir(parents=True)
-    (campaign_file.parent / "done").rename(done.directory.path)
+    train(done)
     checkpoint = done.directory.checkpoint_file.read_bytes()
     blocked.directory.path.mkdir()
     (blocked.directory.path / "thesis.tex").write_text("years of work")
@@ -138,10 +143,16 @@ def test_skips_finishes_evaluates_and_goes_on_past_a_failure(
     before = {file: file.stat().st_mtime_ns for file in output.rglob("seed_*/**/*.*")}
     main(command(campaign_file, output))
     assert {file: file.stat().st_mtime_ns for file in output.rglob("seed_*/**/*.*")} == before
-    # A table is due again for other settings, and if it is older than the checkpoint.
+    # A table is due again for other settings, and if its run has gone on since.
     edit(campaign_file, evaluations=[evaluation | {"bias": [0.5]}])
     assert "finished, 0 of 1 evaluations" in overview(planned(campaign_file, output)[1:])
+    # A copy keeps no times; what counts is the number of iterations.
     os.utime(fresh.directory.checkpoint_file)
+    assert "finished, 1 of 1 evaluations" in overview([fresh])
+    described = path_of(fresh, "noisy").with_suffix(".yaml")
+    assert load_yaml(described)["iterations"] == 2
+    with fresh.directory.metrics_file.open("a") as file:
+        file.write("another,row\n")
     assert "finished, 0 of 1 evaluations" in overview([fresh])
 
 
@@ -160,7 +171,7 @@ def test_changed_settings_and_a_second_campaign_are_refused(
     output = campaign_file.parent / "out"
     edit(campaign_file, matrix={"seed": [0]})
     (this,) = planned(campaign_file, output)
-    run(compose(PENDULUM, [*this.overrides, f"run_dir={this.directory.path}"]))
+    train(this)
     error = ended_badly(command(campaign_file, output, "discount=0.9"), capsys)
     assert "discount: 0.99 there, 0.9 now" in error
     assert "--output" in error
@@ -169,6 +180,74 @@ def test_changed_settings_and_a_second_campaign_are_refused(
     with (output / ".lock").open() as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         assert "another campaign" in ended_badly(command(campaign_file, output), capsys)
+    before = (output / "campaign.yaml").read_text()
+    edit(campaign_file, name="other")
+    error = ended_badly(command(campaign_file, output), capsys)
+    assert "belongs to another campaign, tiny" in error
+    assert "--output" in error
+    assert (output / "campaign.yaml").read_text() == before
+
+
+def test_recipe_edited_meanwhile_changes_no_planned_run(campaign_file: Path) -> None:
+    recipe = campaign_file.with_name("own.yaml")
+    text = "defaults: [metrpo_recipe, _self_]\nrecipe: own\ntask: inverted_pendulum\n"
+    recipe.write_text(text + "discount: 0.9\n")
+    edit(campaign_file, matrix={"seed": [0]}, recipe="own.yaml")
+    runs = planned(campaign_file, campaign_file.parent / "out")
+    recipe.write_text(text + "discount: 0.8\n")
+    assert jobs.work_on_runs(runs, 1) == []
+    assert OmegaConf.load(runs[0].directory.config_file).discount == 0.9
+    assert runs[0].problem() is None
+    with pytest.raises(RunDirectoryError, match=r"0\.9 there, 0\.8 now"):
+        planned(campaign_file, campaign_file.parent / "out")
+
+
+def test_launcher_that_leaves_runs_or_trains_others_is_told(
+    campaign_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A launcher that lost some of its jobs, and one that composed a recipe edited meanwhile."""
+    output = campaign_file.parent / "out"
+    monkeypatch.setattr(jobs, "_child", lambda *arguments: ["true"])
+    error = ended_badly(command(campaign_file, output, "--launcher", "basic"), capsys)
+    assert "2 of 2 runs are not as planned" in error
+    assert "seed=0 has 0 of 2 iterations" in error
+    edit(campaign_file, matrix={"seed": [0]}, evaluations=[{"name": "all"}])
+    (this,) = planned(campaign_file, output)
+
+    def train_another(*arguments: str) -> list[str]:
+        train(this, discount=0.5)
+        return ["true"]
+
+    monkeypatch.setattr(jobs, "_child", train_another)
+    error = ended_badly(command(campaign_file, output, "--launcher", "basic"), capsys)
+    assert "discount: 0.5 there, 0.99 now" in error
+    assert not path_of(this, "all").exists()
+
+
+def test_run_that_lost_its_directory_says_so_to_the_workers(campaign_file: Path) -> None:
+    this, _ = planned(campaign_file, campaign_file.parent / "out")
+    with (
+        this.directory.open(this.settings(), resume=False),
+        pytest.raises(SystemExit) as exit_info,
+    ):
+        child.train({**this.settings(), "resume": True})
+    assert exit_info.value.code == os.EX_TEMPFAIL
+
+
+def test_time_left_goes_by_real_steps(
+    campaign_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    edit(campaign_file, matrix={"episode_steps": [5, 15], "seed": [0]})
+    runs = planned(campaign_file, campaign_file.parent / "out")
+    assert [this.steps_per_iteration for this in runs] == [2 * 5, 2 * 15]
+    clock = SimpleNamespace(monotonic=iter([0.0, 10.0]).__next__)
+    monkeypatch.setattr(progress, "time", clock)
+    monkeypatch.setattr(progress, "result", lambda this: "done")
+    bar = progress.Progress(runs)
+    bar.finished(runs[0])
+    bar.close()
+    # 20 steps took 10 s, 60 are left.
+    assert "about 00:30 of training left" in capsys.readouterr().out
 
 
 def test_directory_of_a_running_run_is_held(tmp_path: Path) -> None:
@@ -191,7 +270,7 @@ def test_list_shows_states_and_does_nothing(
     ]
     assert not output.exists()
     this, _ = planned(campaign_file, output)
-    run(compose(PENDULUM, [*this.overrides, f"run_dir={this.directory.path}"]))
+    train(this)
     main(command(campaign_file, output, "--list", "outer_iterations=3"))
     lines = capsys.readouterr().out.splitlines()
     assert lines[-3] == "2 of 3 iterations  metrpo/inverted_pendulum seed=0"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_l1.campaign.workers import Job, Stopped, Workers, available_cores
+from torchrl_l1.campaign.workers import Job, Stopped, Unfinished, Workers, available_cores
 
 MakeJob = Callable[..., Job]
 
@@ -41,10 +41,9 @@ def test_failures_are_told_with_their_log_and_stop_nothing(make_job: MakeJob) ->
         make_job("exit 0", lambda: [make_job("true", lambda: ended.append("late") or [])]),
     ]
     failures = workers(1).work(jobs)
-    assert [failure.status for failure in failures] == [3, -9]
+    assert [failure.how for failure in failures] == ["ended with status 3", "ended with signal 9"]
     assert str(failures[0]).startswith("echo out; echo wrong >&2; exit 3 ended with status 3")
     assert str(failures[0]).splitlines()[1:] == ["    out", "    wrong"]
-    assert "signal 9" in str(failures[1])
     assert ended == ["late"]
 
 
@@ -55,8 +54,8 @@ def test_no_more_processes_than_workers_and_what_follows_comes_first(make_job: M
         return lambda: order.append(name) or list(then)
 
     ticks: list[int] = []
-    evaluation = make_job("true", note("a's evaluation"))
-    jobs = [make_job("true", note("a", evaluation)), make_job("true", note("b"))]
+    evaluation = make_job("sleep 0.3", note("a's evaluation"))
+    jobs = [make_job("sleep 0.3", note("a", evaluation)), make_job("sleep 0.3", note("b"))]
     workers(1, ticks).work(jobs)
     assert order == ["a", "a's evaluation", "b"]
     assert max(ticks) == 1
@@ -76,11 +75,25 @@ def test_waits_for_a_process_that_is_not_its_own(make_job: MakeJob, tmp_path: Pa
 
 
 def test_tries_again_if_another_process_was_quicker(make_job: MakeJob, tmp_path: Path) -> None:
-    orphan, started = tmp_path / "orphan", tmp_path / "started"
-    threading.Timer(0.5, lambda: orphan.unlink()).start()
-    # The first attempt finds that another process has taken the directory meanwhile.
-    script = f"test -e {started} || {{ touch {started} {orphan}; exit 1; }}"
-    assert workers(1).work([make_job(script, held=orphan.exists)]) == []
+    started = tmp_path / "started"
+    ended: list[str] = []
+    # The first attempt finds that another process has the directory, which then ends at once: by
+    # the time the workers look, nobody holds it any more.
+    script = f"test -e {started} || {{ touch {started}; exit {os.EX_TEMPFAIL}; }}"
+    job = make_job(script, lambda: ended.append("done") or [])
+    assert workers(1).work([job]) == []
+    assert ended == ["done"]
+
+
+def test_good_end_without_the_work_is_a_failure(make_job: MakeJob) -> None:
+    def done() -> list[Job]:
+        raise Unfinished("it has 3 of 4 iterations")
+
+    ended: list[str] = []
+    jobs = [make_job("echo bye", done), make_job("true", lambda: ended.append("next") or [])]
+    (failure,) = workers(1).work(jobs)
+    assert str(failure).startswith("echo bye ended well, but it has 3 of 4 iterations")
+    assert ended == ["next"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -16,6 +16,7 @@ import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+import torchrl_l1
 from torchrl_l1.algorithms.metrpo_metrics import METRICS
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError, save_atomically
@@ -39,7 +40,9 @@ def test_run_directory_has_what_is_promised(tiny_recipe: Recipe) -> None:
     assert set(rows[0]) == set(METRICS)
     config = OmegaConf.load(directory / "config.yaml")
     assert (config.seed, config.task, config.l1.enabled) == (5, "inverted_pendulum", True)
-    assert json.loads((directory / "versions.json").read_text())["torch"] == torch.__version__
+    versions = json.loads((directory / "versions.json").read_text())
+    assert versions["torch"] == torch.__version__
+    assert versions["torchrl-l1"] == torchrl_l1.__version__
     for name in ("model.pt", "policy.pt", "checkpoint.pt"):
         assert torch.load(directory / name, weights_only=True)
     assert not list(directory.glob("*.tmp"))
@@ -82,6 +85,49 @@ def test_run_killed_before_its_first_checkpoint_starts_over(
     assert (directory / "metrics.csv").read_text() == complete
 
 
+@pytest.mark.parametrize("last", ["checkpoint.pt", "model.pt", "policy.pt", "timing.csv"])
+def test_kill_among_the_files_of_the_last_iteration_leaves_no_stale_ones(
+    last: str, tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kill right after each of them: the run is not finished, and all is right once it is."""
+    whole = run(tiny_recipe(f"run_dir={tmp_path / 'whole'}"))
+    run(tiny_recipe("outer_iterations=1"))
+    replace = os.replace
+
+    def replace_and_die(source: Path, target: Path) -> None:
+        replace(source, target)
+        if target.name == last:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", replace_and_die)
+    with pytest.raises(KeyboardInterrupt):
+        run(tiny_recipe("resume=true"))
+    monkeypatch.undo()
+    assert RunDirectory(tmp_path / "run").iterations_done() == 1
+    run(tiny_recipe("resume=true"))
+    killed = tmp_path / "run"
+    assert (killed / "metrics.csv").read_text() == (whole / "metrics.csv").read_text()
+    assert len((killed / "timing.csv").read_text().splitlines()) == 3
+    for name in ("model.pt", "policy.pt"):
+        found, expected = (torch.load(folder / name) for folder in (killed, whole))
+        torch.testing.assert_close(found, expected, rtol=0, atol=0)
+
+
+def test_settings_that_are_newer_than_a_run_have_their_defaults(
+    tiny_recipe: Recipe, tmp_path: Path
+) -> None:
+    directory = run(tiny_recipe("outer_iterations=1"))
+    config = OmegaConf.load(directory / "config.yaml")
+    del config.threads, config.model.box_margin
+    OmegaConf.save(config, directory / "config.yaml")
+    run(tiny_recipe("resume=true"))
+    assert RunDirectory(directory).iterations_done() == 2
+    del config.model.members  # 2 here, 5 by default
+    OmegaConf.save(config, directory / "config.yaml")
+    with pytest.raises(RunDirectoryError, match=r"model.members: 5 there, 2 now"):
+        run(tiny_recipe("resume=true"))
+
+
 def test_second_process_in_the_same_directory_is_refused(tmp_path: Path) -> None:
     first, second = RunDirectory(tmp_path / "run"), RunDirectory(tmp_path / "run")
     with (
@@ -110,7 +156,17 @@ def test_bad_settings_are_refused_before_anything_is_written(
         ("l1.on_switch=forget", "on_switch"),
         ("l1.epsilon=-1", "epsilon"),
         ("model.activation=gelu", "activation"),
-        ("policy.std=0", "standard deviation"),
+        ("model.members=0", r"model\.members"),
+        ("model.hidden=[8,0]", r"model\.hidden"),
+        ("model.std_floor=0", r"model\.std_floor"),
+        ("model.box_margin=-1", r"model\.box_margin"),
+        ("policy.std=0", r"policy\.std"),
+        ("policy.hidden=[0]", r"policy\.hidden"),
+        ("perturbation.observation_noise=-0.1", r"perturbation\.observation_noise"),
+        ("perturbation.actuator_bias=inf", r"perturbation\.actuator_bias"),
+        ("threads=0", "threads"),
+        ("horizon=0", "horizon"),
+        ("clip_actions=false", "without L1"),
         ("device=tpu", "device must be"),
         ("l1.compile=maybe", r"l1\.compile"),
         ("trpo.fisher_fraction=0", r"trpo\.fisher_fraction"),

@@ -48,6 +48,8 @@ def run_directory(
     iterations: int | None = None,
     steps: int = 2500,
     evaluations: dict[str, list[dict[str, Any]]] | None = None,
+    signals: dict[str, Sequence[float]] | None = None,
+    timings: Sequence[dict[str, float]] | None = None,
 ) -> Path:
     """A run directory with these returns, one per outer iteration."""
     path.mkdir(parents=True)
@@ -60,11 +62,14 @@ def run_directory(
     means = list(returns if deterministic is None else deterministic)
     rows = [
         {"iteration": i, "real_steps": (i + 2) * steps, "return_mean": value,
-         "return_std": 1.0, "return_deterministic": means[i], "policy/std": 0.5}
+         "return_std": 1.0, "return_deterministic": means[i], "policy/std": 0.5,
+         **{name: values[i] for name, values in (signals or {}).items()}}
         for i, value in enumerate(returns)
     ]  # fmt: skip
     if rows:
         write_rows(path / "metrics.csv", rows)
+    if timings:
+        write_rows(path / "timing.csv", timings)
     for name, tests in (evaluations or {}).items():
         write_rows(path / "evaluations" / f"{name}.csv", tests)
     return path

@@ -118,6 +118,52 @@ def test_campaign_with_overrides_is_repeated_from_its_file(campaign: Path) -> No
     assert expected in report([campaign]).read_text()
 
 
+def test_comparisons_say_the_settings_of_each_cell(write_run: WriteRun, tmp_path: Path) -> None:
+    # The two tasks have other main epsilons: the same departure is another variant in each.
+    for recipe, usual in (("metrpo/inverted_pendulum", "1.0"), ("metrpo/swimmer", "2.0")):
+        for noise in ("none", "action"):
+            write_run([1], "l1=paper", f"noise={noise}", f"l1.epsilon={usual}", recipe=recipe)
+        write_run([1], "l1=paper", f"l1.epsilon={usual}", "label=nominal", recipe=recipe)
+        write_run([1], "l1=paper", "l1.epsilon=5", "label=nominal", recipe=recipe)
+    text = report([tmp_path / "runs"]).read_text()
+    section = text.split("\n## By `l1.epsilon` and `label`\n")[1].split("\n## ")[0]
+    cells = re.findall(r"\| (\w+) \| none \| paper \| (l1.epsilon=\S+ label=\w+) ", section)
+    expected = []
+    for task, usual in (("inverted_pendulum", "1.0"), ("swimmer", "2.0")):
+        expected += [
+            (task, f"l1.epsilon={usual}, label=executed"),
+            (task, f"l1.epsilon={usual}, label=nominal"),
+            (task, "l1.epsilon=5.0, label=nominal"),
+        ]
+    assert cells == expected
+
+
+def test_unusual_matrices_make_a_report(write_run: WriteRun, tmp_path: Path) -> None:
+    for seed in range(3):
+        write_run([1], "l1=paper", "label=executed", "l1.epsilon=5", seed=seed)
+    for noise in ("none", "action", "observation"):
+        write_run([1], "l1=paper", f"noise={noise}", "label=nominal", "l1.epsilon=1")
+    text = report([tmp_path / "runs"]).read_text()
+    assert "| inverted_pendulum | observation | paper |" in text
+
+
+def test_unreadable_runs_are_listed_and_left_out(write_run: WriteRun, tmp_path: Path) -> None:
+    write_run([-2, -1], "l1=off", seed=0)
+    lost = write_run([-2, -1], "l1=off", seed=1)
+    file = lost / "metrics.csv"
+    file.write_text(file.read_text().replace("-1.0", "nan"))
+    text = report([tmp_path / "runs"]).read_text()
+    assert "1 runs, of which 1 are finished" in text
+    assert "Left out, since they cannot be read:" in text
+    assert f"- {file}, line 3: return_mean is 'nan', not a finite number" in text
+
+
+def test_controllers_that_are_not_as_shipped_are_told(write_run: WriteRun, tmp_path: Path) -> None:
+    write_run([-2, -1], "l1=slow")
+    text = report([tmp_path / "runs"]).read_text()
+    assert "- inverted_pendulum: `l1.alpha=0.1` (L1 paper)" in text
+
+
 def test_only_begun_runs_make_a_report_without_figures(write_run: WriteRun, tmp_path: Path) -> None:
     write_run([], "l1=off", iterations=3)
     page = report([tmp_path / "runs"], tmp_path / "out")

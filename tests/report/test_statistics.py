@@ -2,14 +2,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchrl_l1.report.statistics import (
     Interval,
-    bootstrap_interval,
     final_return,
+    interquartile_interval,
     interquartile_mean,
+    mean_interval,
     published_spread,
 )
 
@@ -36,22 +38,56 @@ def test_interquartile_mean_against_sorting(values: list[float]) -> None:
 
 
 @settings(max_examples=15, deadline=None)
-@given(SEEDS, st.booleans())
-def test_interval_is_repeatable_and_within_the_values(
-    values: list[float], interquartile: bool
+@given(SEEDS)
+def test_intervals_are_repeatable_and_the_resampled_ones_within_the_values(
+    values: list[float],
 ) -> None:
-    interval = bootstrap_interval(values, interquartile)
-    assert interval == bootstrap_interval(values, interquartile)
+    interval, middle = mean_interval(values), interquartile_interval(values)
+    assert interval == mean_interval(values) and middle == interquartile_interval(values)
     assert interval is not None
-    slack = 1e-6
     # Means of equal values differ in their last digit.
-    assert min(values) - slack <= interval.low <= interval.high + slack
-    assert interval.high <= max(values) + slack
+    slack = 1e-6
+    assert interval.low <= np.mean(values) + slack and np.mean(values) <= interval.high + slack
+    assert (middle is None) == (len(values) < 5)
+    for resampled in [interval] * (len(values) >= 10) + [middle] * (middle is not None):
+        assert resampled is not None
+        assert min(values) - slack <= resampled.low <= resampled.high + slack
+        assert resampled.high <= max(values) + slack
+
+
+@pytest.mark.parametrize("count", [3, 5, 9])
+def test_interval_of_few_values_is_students(count: int) -> None:
+    values = np.random.default_rng(count).normal(5.0, 2.0, count)
+    expected = scipy.stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+    interval = mean_interval(values.tolist())
+    assert interval is not None
+    assert (interval.low, interval.high) == pytest.approx((expected.low, expected.high))
+
+
+@pytest.mark.parametrize("count", [3, 4, 5])
+def test_interval_of_few_normal_values_covers_what_it_says(count: int) -> None:
+    samples = np.random.default_rng(0).normal(0.0, 1.0, (2000, count))
+    intervals = [mean_interval(values) for values in samples.tolist()]
+    covered = np.mean([one is not None and one.low <= 0 <= one.high for one in intervals])
+    assert 0.93 < covered < 0.97
+
+
+@pytest.mark.parametrize("count", [5, 8, 12])
+def test_interquartile_interval_has_the_percentiles_of_resampled_means(count: int) -> None:
+    values = np.random.default_rng(count).normal(0.0, 10.0, count)
+    draws = np.random.default_rng(1).choice(values, (20_000, count))
+    cut = count // 4
+    middle = np.sort(draws, axis=1)[:, cut : count - cut].mean(axis=1)
+    low, high = np.quantile(middle, [0.025, 0.975])
+    interval = interquartile_interval(values.tolist())
+    assert interval is not None
+    assert interval.low == pytest.approx(low, abs=0.4)
+    assert interval.high == pytest.approx(high, abs=0.4)
 
 
 def test_interval_of_many_normal_values_is_that_of_the_textbook() -> None:
     values = np.random.default_rng(1).normal(5.0, 2.0, 400)
-    interval = bootstrap_interval(values.tolist())
+    interval = mean_interval(values.tolist())
     half = 1.96 * values.std(ddof=1) / 20
     assert interval is not None
     assert interval.low == pytest.approx(values.mean() - half, abs=0.03)
@@ -60,7 +96,7 @@ def test_interval_of_many_normal_values_is_that_of_the_textbook() -> None:
 
 def test_interval_is_corrected_for_skewness() -> None:
     values = np.random.default_rng(3).lognormal(0.0, 1.5, 15)
-    interval = bootstrap_interval(values.tolist())
+    interval = mean_interval(values.tolist())
     draws = np.random.default_rng(0).choice(values, (20_000, len(values))).mean(axis=1)
     low, high = np.quantile(draws, [0.025, 0.975])
     # A long upper tail is seen too seldom in a sample: the plain percentiles lie too low.
@@ -68,8 +104,10 @@ def test_interval_is_corrected_for_skewness() -> None:
     assert interval.low > low + 0.02 and interval.high > high + 0.2
 
 
-def test_no_interval_of_fewer_than_three_and_a_point_of_equal_ones() -> None:
-    assert bootstrap_interval([]) is None
-    assert bootstrap_interval([1.0, 5.0]) is None
-    assert bootstrap_interval([4.0, 4.0, 4.0]) == Interval(4.0, 4.0)
-    assert bootstrap_interval([4.0, 4.0, 4.0, 4.0], interquartile=True) == Interval(4.0, 4.0)
+def test_no_interval_of_too_few_and_a_point_of_equal_ones() -> None:
+    assert mean_interval([]) is None
+    assert mean_interval([1.0, 5.0]) is None
+    assert interquartile_interval([10.0, 300.0, 350.0, 900.0]) is None
+    for count in (3, 9, 10):
+        assert mean_interval([4.0] * count) == Interval(4.0, 4.0)
+    assert interquartile_interval([4.0] * 5) == Interval(4.0, 4.0)

@@ -7,12 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.stats
 from scipy.stats import trim_mean
 
+from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.report.evaluation_tables import ablation_rows, evaluation_rows
-from torchrl_l1.report.rendering import ablation_table, evaluation_table, paired_table
-from torchrl_l1.report.runs import find_runs
-from torchrl_l1.report.tables import markdown, write_csv
+from torchrl_l1.report.finding import find_runs
+from torchrl_l1.report.rendering import (
+    ablation_table,
+    evaluation_table,
+    paired_table,
+    training_table,
+)
+from torchrl_l1.report.tables import markdown
 from torchrl_l1.report.training_tables import paired_rows, run_rows, training_row
 from torchrl_l1.report.variants import Study
 
@@ -34,8 +41,8 @@ def test_training_row_against_numpy(write_run: WriteRun, tmp_path: Path) -> None
     assert row["return_mean"] == pytest.approx(per_seed.mean())
     assert row["deterministic_mean"] == pytest.approx(per_seed.mean() / 2)
     assert row["published_spread"] == pytest.approx(returns[:, 3:].std(axis=0).mean())
-    assert per_seed.min() < row["return_low"] < row["return_mean"] < row["return_high"]
-    assert row["return_high"] < per_seed.max()
+    expected = scipy.stats.ttest_1samp(per_seed, 0.0).confidence_interval(0.95)
+    assert (row["return_low"], row["return_high"]) == pytest.approx((expected.low, expected.high))
     assert (row["seeds"], row["real_steps"], row["unfinished"]) == (4, 7 * 2500, "")
     assert (row["paper_mean"], row["paper_std"]) == ("-105.2", "81.6")
 
@@ -57,11 +64,11 @@ def test_unfinished_runs_are_listed_and_not_counted(write_run: WriteRun, tmp_pat
 def test_paired_differences_of_the_seeds_that_both_have(
     write_run: WriteRun, tmp_path: Path
 ) -> None:
-    off, on = RNG.normal(-50, 10, (2, 7, 3))
-    for seed in range(7):
-        if seed != 5:
-            write_run(off[seed], "l1=off", seed=seed)
+    off, on = RNG.normal(-50, 10, (2, 8, 3))
+    for seed in range(8):
         if seed != 6:
+            write_run(off[seed], "l1=off", seed=seed)
+        if seed != 7:
             write_run(on[seed], "l1=paper", seed=seed, iterations=4 if seed == 0 else 3)
     # Seed 0 of the L1 arm has other settings (4 iterations): no pair for it.
     stochastic = [
@@ -70,8 +77,8 @@ def test_paired_differences_of_the_seeds_that_both_have(
         if row["policy"] == "stochastic" and not row["variant"]
     ]
     (row,) = stochastic
-    differences = on[1:5].mean(axis=1) - off[1:5].mean(axis=1)
-    assert (row["pairs"], row["seeds"], row["without_pair"]) == (4, "1 2 3 4", "5")
+    differences = on[1:6].mean(axis=1) - off[1:6].mean(axis=1)
+    assert (row["pairs"], row["seeds"], row["without_pair"]) == (5, "1 2 3 4 5", "6")
     assert row["difference_mean"] == pytest.approx(differences.mean())
     assert row["iqm"] == pytest.approx(trim_mean(differences, 0.25))
     assert [float(v) for v in row["differences"].split()] == pytest.approx(
@@ -79,6 +86,51 @@ def test_paired_differences_of_the_seeds_that_both_have(
     )
     assert row["difference_low"] < row["difference_mean"] < row["difference_high"]
     assert differences.min() <= row["iqm_low"] <= row["iqm_high"] <= differences.max()
+
+
+def test_four_pairs_have_no_interquartile_mean(write_run: WriteRun, tmp_path: Path) -> None:
+    for seed, value in enumerate([10.0, 300.0, 350.0, 900.0]):
+        write_run([0.0], "l1=off", seed=seed)
+        write_run([value], "l1=paper", seed=seed)
+    rows = paired_rows(study(tmp_path))
+    assert rows[0]["difference_mean"] == 390.0
+    # One seed far off: the interval of so few values holds 0.
+    assert rows[0]["difference_low"] < 0 < rows[0]["difference_high"]
+    assert not any(key.startswith("iqm") for row in rows for key in row)
+    assert "interquartile" not in paired_table(rows)
+
+
+def test_training_row_says_what_l1_did(write_run: WriteRun, tmp_path: Path) -> None:
+    for seed in range(2):
+        signals = {"l1/switch_rate": [9.0, 0.1 + seed], "l1/u_a": [1.0, 2.0 + seed]}
+        signals["l1/saturation"] = [0.0, 0.5]
+        write_run([1, 2], "l1=paper", seed=seed, signals=signals)
+        write_run([1, 2], "l1=off", seed=seed)
+    rows = {cell.arm: training_row(cell, runs) for cell, runs in study(tmp_path).cells.items()}
+    assert rows["paper"]["switches_per_1000"] == pytest.approx(1000 * np.mean([4.55, 5.05]))
+    assert rows["paper"]["u_a"] == pytest.approx(np.mean([1.5, 2.0]))
+    assert rows["paper"]["saturation"] == pytest.approx(0.25)
+    assert "switches_per_1000" not in rows["off"] and "ms_per_step" not in rows["paper"]
+    text = training_table(list(rows.values()))
+    assert "| switches per 1000 steps | L1 input | saturation |" in text
+    assert "| 4800 | 1.75 | 0.25 |" in text
+    assert "ms per step" not in text
+    assert "switches" not in training_table([rows["off"]])
+
+
+def test_the_papers_cells_stand_beside_its_controller_only(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    tests = evaluated(-1.0, ("off", "action", "stochastic", 0.0))
+    mine = {"evaluations": {"ablation": tests}}
+    write_run([1.0], "l1=slow", "noise=action", **mine)
+    (slow,) = (training_row(cell, runs) for cell, runs in study(tmp_path).cells.items())
+    assert (slow["l1"], slow["variant"]) == ("paper", "") and "paper_mean" not in slow
+    assert "paper_mean" not in evaluation_rows(study(tmp_path), "ablation")[0]
+    write_run([1.0], "l1=paper", "noise=action", seed=1, **mine)
+    rows = [training_row(cell, runs) for cell, runs in study(tmp_path).cells.items()]
+    shown = {row["variant"]: row.get("paper_mean") for row in rows}
+    assert shown == {"": "-0.0", "l1.alpha=0.1": None}
 
 
 def test_few_pairs_are_shown_as_they_are(write_run: WriteRun, tmp_path: Path) -> None:
@@ -164,6 +216,47 @@ def test_ablation_takes_the_noise_of_the_training_and_one_l1(
     assert "paper, training only" in ablation_table(rows)
 
 
+def test_ablation_leaves_disturbed_tests_out(write_run: WriteRun, tmp_path: Path) -> None:
+    tests = [
+        row | {"bias": bias, "gain": gain}
+        for row in evaluated(-1.0, ("off", "none", "stochastic", 0.0))
+        for bias, gain in ((0.0, 1.0), (1.0, 1.0), (0.0, 0.6))
+    ]
+    write_run([1.0], "l1=off", evaluations={"ablation": tests})
+    (row,) = ablation_rows(evaluation_rows(study(tmp_path), "ablation"))
+    assert (row["bias"], row["gain"]) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "own", "expected"),
+    [
+        # Tables that are older than the column own_l1 were made with the options as shipped.
+        (("l1=paper", "l1.epsilon=7"), None, ["paper", "slow"]),
+        (("l1=paper", "l1.alpha=0.2"), None, ["paper (not as trained)", "slow"]),
+        (("l1=paper", "l1.on_switch=reset"), None, ["paper (not as trained)", "slow"]),
+        (("l1=slow",), None, ["paper (not as trained)", "paper"]),
+        (("l1=paper", "l1.alpha=0.2"), "paper", ["paper", "slow"]),
+        (("l1=slow",), "slow", ["paper (not as trained)", "paper"]),
+        (("l1=off",), None, ["paper", "slow"]),
+    ],
+)
+def test_both_means_the_controller_of_the_training(
+    write_run: WriteRun,
+    tmp_path: Path,
+    overrides: tuple[str, ...],
+    own: str | None,
+    expected: list[str],
+) -> None:
+    tests = evaluated(-1.0, *((l1, "none", "stochastic", 0.0) for l1 in ("off", "paper", "slow")))
+    if own is not None:
+        tests = [row | {"own_l1": int(row["l1"] == own)} for row in tests]
+    write_run([1.0], *overrides, evaluations={"ablation": tests})
+    rows = evaluation_rows(study(tmp_path), "ablation")
+    assert sorted(row["l1"] for row in rows) == sorted(["off", *expected])
+    both = [row["l1"] for row in ablation_rows(rows) if row["phase"] == "both"]
+    assert both == ["paper"] * (overrides != ("l1=off",) and "paper" in expected)
+
+
 def test_control_affine_runs_have_no_published_cell(write_run: WriteRun, tmp_path: Path) -> None:
     tests = evaluated(-1.0, ("off", "action", "stochastic", 0.0))
     write_run([1.0], "l1=off", "model=affine", evaluations={"sim_to_real": tests})
@@ -178,8 +271,12 @@ def test_markdown_drops_columns_that_say_nothing() -> None:
     assert markdown(rows) == "| a | c |\n|---|---|\n| 1 | – |\n| 2 | 3 |"
 
 
+def test_markdown_without_rows_is_empty() -> None:
+    assert markdown([]) == ""
+
+
 def test_csv_keeps_full_precision_and_all_columns(tmp_path: Path) -> None:
-    write_csv(tmp_path / "table.csv", [{"a": 1 / 3}, {"a": 2.0, "b": "x, y"}])
+    write_table(tmp_path / "table.csv", [{"a": 1 / 3}, {"a": 2.0, "b": "x, y"}])
     with (tmp_path / "table.csv").open() as file:
         first, second = csv.DictReader(file)
     assert float(first["a"]) == 1 / 3

@@ -2,8 +2,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-from torchrl_l1.report.runs import find_runs
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchrl_l1.report.finding import find_runs
+from torchrl_l1.report.runs import Run
+from torchrl_l1.report.settings import Identity
 from torchrl_l1.report.variants import Cell, Study, variant_text
 
 WriteRun = Callable[..., Path]
@@ -65,6 +72,66 @@ def test_of_equal_runs_the_furthest_counts(write_run: WriteRun, tmp_path: Path) 
     assert {run.path for run in study.duplicates} == {short, equal}
 
 
+def test_equal_runs_share_their_evaluations(write_run: WriteRun, tmp_path: Path) -> None:
+    def tests(*biases: float) -> list[dict[str, Any]]:
+        row = {"l1": "off", "noise": "none", "gain": 1.0, "policy": "stochastic", "episodes": 25}
+        return [row | {"bias": bias, "return_mean": bias} for bias in biases]
+
+    write_run([1, 2], name="a", iterations=2)
+    write_run([1, 2], name="b", iterations=2, evaluations={"mine": tests(0), "ablation": tests(0)})
+    write_run([1, 2], name="c", iterations=2, evaluations={"mine": tests(0, 1)})
+    # Other returns: another policy, whose results do not mix with the first one's.
+    write_run([1, 9], name="d", iterations=2, evaluations={"mine": tests(2), "late": tests(3)})
+    # Not the final policy.
+    write_run([1], name="e", iterations=2, evaluations={"early": tests(0)})
+    study = Study(find_runs([tmp_path]))
+    (run,) = study.runs
+    assert run.path.name == "a"
+    biases = {name: [test.bias for test in found] for name, found in run.evaluations.items()}
+    assert biases == {"mine": [0.0, 1.0], "ablation": [0.0], "late": [3.0]}
+    assert sorted(run.path.name for run in study.duplicates) == ["b", "c", "d", "e"]
+
+
+def test_every_task_has_a_main_cell(write_run: WriteRun, tmp_path: Path) -> None:
+    # Most L1 runs have an epsilon that no run with the main label has.
+    for noise in ("none", "action", "observation"):
+        write_run([1], "l1=paper", f"noise={noise}", "label=nominal", "l1.epsilon=1")
+        for seed in range(3):
+            write_run([1], "l1=paper", "noise=none", "label=executed", "l1.epsilon=5", seed=seed)
+    study = Study(find_runs([tmp_path]))
+    assert study.main_settings("inverted_pendulum", "paper") == {
+        "label": "nominal",
+        "l1.epsilon": "1.0",
+    }
+    assert sum(not cell.variant for cell in study.cells) == 3
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.tuples(*(st.integers(0, 2) for _ in range(4))), min_size=1, max_size=12))
+def test_whatever_was_run_a_task_has_a_main_cell(runs: list[tuple[int, int, int, int]]) -> None:
+    made = []
+    for seed, (noise, arm, label, epsilon) in enumerate(runs):
+        name = ("off", "paper", "reference")[arm]
+        l1 = {} if arm == 0 else {"l1.epsilon": str(epsilon)}
+        identity = Identity(
+            "swimmer", str(noise), name, seed, 1, {"label": str(label)}, l1, {}, name
+        )
+        empty = np.empty(0)
+        made.append(Run(Path(str(seed)), identity, empty, empty, empty, {}, empty))
+    assert any(not cell.variant for cell in Study(made).cells)
+
+
+def test_a_sweep_of_the_filter_is_one_comparison(write_run: WriteRun, tmp_path: Path) -> None:
+    for noise in ("none", "action"):
+        write_run([1], "l1=paper", f"noise={noise}")
+    written = [write_run([1], "l1=paper", f"l1.alpha={a}") for a in ("0.05", "0.1", "0.35")]
+    study = Study(find_runs([tmp_path]))
+    assert [run.path for run in study.duplicates] == written[2:]
+    assert study.comparisons() == [("l1.alpha",)]
+    found = [study.describe(cell, ("l1.alpha",)) for cell in study.compared(("l1.alpha",))]
+    assert found == ["l1.alpha=0.35", "l1.alpha=0.05", "l1.alpha=0.1"]
+
+
 def test_comparisons_hold_departures_against_the_main_cells(
     write_run: WriteRun, tmp_path: Path
 ) -> None:
@@ -82,8 +149,8 @@ def test_comparisons_hold_departures_against_the_main_cells(
     described = [study.describe(cell, ("l1.alpha", "l1.epsilon")) for cell in found]
     assert described == [
         "",
-        "l1.alpha=null, l1.epsilon=1.0",
-        "l1.alpha=null, l1.epsilon=5.0",
+        "l1.alpha=0.35, l1.epsilon=1.0",
+        "l1.alpha=0.35, l1.epsilon=5.0",
         "l1.alpha=0.2, l1.epsilon=5.0",
     ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -43,6 +44,18 @@ class Perturbation:
     observation_noise: float = 0.0
     actuator_bias: float = 0.0
     actuator_gain: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse settings that could only fail later.
+
+        Raises:
+            ValueError: naming the setting.
+        """
+        for name, value in vars(self).items():
+            if not math.isfinite(value):
+                raise ValueError(f"perturbation.{name} must be finite, got {value}")
+            if name.endswith("_noise") and value < 0:
+                raise ValueError(f"perturbation.{name} must not be negative, got {value}")
 
 
 def make_pipeline(

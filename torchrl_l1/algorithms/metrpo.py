@@ -28,7 +28,7 @@ from torchrl_l1.algorithms.collection import (
     signal_metrics,
 )
 from torchrl_l1.algorithms.device import resolve_device
-from torchrl_l1.algorithms.metrpo_config import METRPOConfig
+from torchrl_l1.algorithms.metrpo_config import METRPOConfig, check_clipping
 from torchrl_l1.algorithms.metrpo_metrics import fit_metrics, policy_metrics
 from torchrl_l1.algorithms.policy import GaussianPolicy, acting
 from torchrl_l1.algorithms.policy_improvement import PolicyImprovement
@@ -81,11 +81,7 @@ class METRPO:
         compile_l1: CompileMode = False,
         on_phase: Callable[[str], None] | None = None,
     ) -> None:
-        if l1 is not None and not config.clip_actions:
-            raise ValueError(
-                "clip_actions=false is for runs without L1: the adaptive controller always keeps "
-                "the action within its bounds (use l1=off)"
-            )
+        check_clipping(config.clip_actions, l1 is not None)
         self.config, self.seed = config, seed
         self.device = resolve_device(device)
         self.on_phase = on_phase or (lambda phase: None)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import get_args
 
 from torchrl_l1.dynamics import MODEL_FORMS, FitConfig
+from torchrl_l1.dynamics.ensemble import ActivationName
 from torchrl_l1.objectives import TRPOConfig
 
 
@@ -31,14 +35,21 @@ class ModelConfig:
     box_margin: float = 0.5
 
     def __post_init__(self) -> None:
-        """Refuse a form that does not exist.
+        """Refuse settings that could only fail later.
 
         Raises:
             ValueError: naming the setting.
         """
-        if self.form not in MODEL_FORMS:
-            allowed = " or ".join(map(repr, MODEL_FORMS))
-            raise ValueError(f"model.form must be {allowed}, got {self.form!r}")
+        _check_choice("model.form", self.form, MODEL_FORMS)
+        _check_choice("model.activation", self.activation, get_args(ActivationName))
+        if self.members < 1:
+            raise ValueError(f"model.members must be at least 1, got {self.members}")
+        _check_widths("model.hidden", self.hidden)
+        _check_positive("model.std_floor", self.std_floor)
+        if not (self.box_margin >= 0 and math.isfinite(self.box_margin)):
+            raise ValueError(
+                f"model.box_margin must be finite and not negative, got {self.box_margin}"
+            )
 
 
 @dataclass
@@ -57,6 +68,15 @@ class PolicyConfig:
     std: float = 1.0
     reset_std: bool = True
     normalize: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse settings that could only fail later.
+
+        Raises:
+            ValueError: naming the setting.
+        """
+        _check_widths("policy.hidden", self.hidden)
+        _check_positive("policy.std", self.std)
 
 
 @dataclass
@@ -126,12 +146,8 @@ class METRPOConfig:
         Raises:
             ValueError: naming the setting.
         """
-        choices = {"label": ("nominal", "executed"), "box_exit": ("truncate", "fail")}
-        for name, allowed in choices.items():
-            if getattr(self, name) not in allowed:
-                raise ValueError(
-                    f"{name} must be {' or '.join(map(repr, allowed))}, got {getattr(self, name)!r}"
-                )
+        _check_choice("label", self.label, ("nominal", "executed"))
+        _check_choice("box_exit", self.box_exit, ("truncate", "fail"))
         if self.episode_steps is not None and self.episode_steps < 1:
             raise ValueError(f"episode_steps must be at least 1 or null, got {self.episode_steps}")
         counts = ("outer_iterations", "episodes_per_iteration", "evaluation_episodes")
@@ -146,3 +162,31 @@ class METRPOConfig:
         for name in ("imagined_from_data", "discount", "gae_lambda"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
+
+
+def check_clipping(clip_actions: bool, with_l1: bool) -> None:
+    """Refuse unclipped actions where L1 acts.
+
+    Raises:
+        ValueError: saying what to change.
+    """
+    if with_l1 and not clip_actions:
+        raise ValueError(
+            "clip_actions=false is for runs without L1: the adaptive controller always keeps "
+            "the action within its bounds (use l1=off)"
+        )
+
+
+def _check_choice(name: str, value: str, allowed: Sequence[str]) -> None:
+    if value not in allowed:
+        raise ValueError(f"{name} must be {' or '.join(map(repr, allowed))}, got {value!r}")
+
+
+def _check_positive(name: str, value: float) -> None:
+    if not (value > 0 and math.isfinite(value)):
+        raise ValueError(f"{name} must be finite and positive, got {value}")
+
+
+def _check_widths(name: str, widths: Sequence[int]) -> None:
+    if any(width < 1 for width in widths):
+        raise ValueError(f"{name} must hold widths of at least 1, got {list(widths)}")

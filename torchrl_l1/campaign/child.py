@@ -1,4 +1,4 @@
-"""The processes that a campaign starts: ``PARENT run ...`` or ``PARENT evaluate DIR JSON``.
+"""The processes that a campaign starts: to train, to evaluate, or ``torchrl-l1`` for a sweep.
 
 Not for users: they end when the campaign's own process, PARENT, ends, however it does.
 """
@@ -10,7 +10,8 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 _PR_SET_PDEATHSIG = 1
 
@@ -32,7 +33,9 @@ def main(arguments: Sequence[str]) -> None:
     """Entry point of the process."""
     parent, command, *rest = arguments
     end_with(int(parent))
-    if command == "evaluate":
+    if command == "train":
+        train(json.loads(rest[0]))
+    elif command == "evaluate":
         from torchrl_l1.campaign.evaluation import evaluate_run
 
         run_dir, evaluations = rest
@@ -42,6 +45,31 @@ def main(arguments: Sequence[str]) -> None:
         from torchrl_l1.cli import main as command_line
 
         command_line([command, *rest])
+
+
+def train(settings: Mapping[str, Any]) -> None:
+    """Train or go on as the campaign has planned it, whatever has become of the recipe since.
+
+    Exits with ``EX_TEMPFAIL`` if another process is running in the run directory.
+    """
+    from omegaconf import DictConfig, OmegaConf
+
+    from torchrl_l1.experiment.errors import USER_ERRORS, message
+    from torchrl_l1.experiment.run import run
+    from torchrl_l1.experiment.run_directory import RunDirectoryInUse
+    from torchrl_l1.experiment.schema import METRPORecipe
+
+    config = OmegaConf.merge(OmegaConf.structured(METRPORecipe), dict(settings))
+    assert isinstance(config, DictConfig)
+    try:
+        run(config)
+    except RunDirectoryInUse as error:
+        print(error, file=sys.stderr)
+        sys.exit(os.EX_TEMPFAIL)
+    except USER_ERRORS as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        sys.exit(message(error))
 
 
 if __name__ == "__main__":

@@ -11,12 +11,12 @@ from pathlib import Path
 
 from torchrl_l1.campaign.description import read_campaign
 from torchrl_l1.campaign.jobs import launch_runs, work_on_runs
-from torchrl_l1.campaign.launcher import check_launcher
+from torchrl_l1.campaign.launcher import check_launcher, elsewhere
 from torchrl_l1.campaign.plan import plan
 from torchrl_l1.campaign.progress import overview
-from torchrl_l1.campaign.settings import CampaignError, override_key
+from torchrl_l1.campaign.settings import Campaign, CampaignError, override_key
 from torchrl_l1.campaign.workers import Stopped, available_cores
-from torchrl_l1.campaign.yaml_file import dump_yaml
+from torchrl_l1.campaign.yaml_file import dump_yaml, load_yaml
 from torchrl_l1.experiment.run_directory import write_atomically
 
 
@@ -36,7 +36,8 @@ def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> N
         check_launcher(options.launcher)
     campaign = read_campaign(options.campaign, [o for o in overrides if o not in for_hydra])
     output = Path(options.output or f"runs/campaigns/{campaign.name}").resolve()
-    runs = plan(campaign, output)
+    _check_owner(output, campaign)
+    runs = plan(campaign, output, elsewhere=bool(options.launcher) and elsewhere(options.launcher))
     if options.list:
         print(overview(runs))
         return
@@ -49,7 +50,7 @@ def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> N
                 failures = launch_runs(
                     campaign, output, runs, options.launcher, options.workers, for_hydra
                 )
-                runs_here = [run for run in runs if run.finished()]
+                runs_here = [run for run in runs if run.problem() is None]
             else:
                 runs_here = runs
             failures += work_on_runs(runs_here, options.workers or available_cores())
@@ -62,6 +63,19 @@ def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> N
         print(f"{len(failures)} failed; the same command tries them again", file=sys.stderr)
         sys.exit(1)
     print(f"Finished: {len(runs)} runs in {output}")
+
+
+def _check_owner(output: Path, campaign: Campaign) -> None:
+    file = output / "campaign.yaml"
+    if not file.exists():
+        return
+    content = load_yaml(file)
+    name = str(content.get("name")) if isinstance(content, dict) else file.name
+    if name != campaign.name:
+        raise CampaignError(
+            f"{output} belongs to another campaign, {name}; give {campaign.name} a folder of its "
+            "own with --output"
+        )
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from typing import Any
 from torchrl_l1.campaign.settings import EvaluationSettings
 from torchrl_l1.campaign.yaml_file import dump_yaml, load_yaml
 from torchrl_l1.experiment.evaluate import conditions, evaluate, load_run
-from torchrl_l1.experiment.run_directory import RunDirectory, write_atomically
+from torchrl_l1.experiment.run_directory import RunDirectory, write_atomically, write_table
 
 
 def evaluation_file(run_dir: Path, name: str) -> Path:
@@ -18,15 +18,18 @@ def evaluation_file(run_dir: Path, name: str) -> Path:
 
 
 def is_evaluated(directory: RunDirectory, settings: EvaluationSettings) -> bool:
-    """Whether the table is there, made from these settings and from the last checkpoint."""
+    """Whether the table is there, made with these settings after the last iteration."""
     table = evaluation_file(directory.path, settings.name)
     try:
-        if table.stat().st_mtime_ns < directory.checkpoint_file.stat().st_mtime_ns:
-            return False
         before: object = load_yaml(table.with_suffix(".yaml"))
     except (OSError, ValueError):
         return False
-    return before == settings.of_a_run()
+    return table.exists() and before == _described(settings, directory.iterations_done())
+
+
+def _described(settings: EvaluationSettings, iterations: int) -> dict[str, Any]:
+    """What a table was made from: settings, and how many outer iterations the run had."""
+    return {**settings.of_a_run(), "iterations": iterations}
 
 
 def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
@@ -52,6 +55,6 @@ def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
     table.parent.mkdir(exist_ok=True)
     # In this order: no kill leaves a table beside the settings of another one.
     described.unlink(missing_ok=True)
-    RunDirectory(run_dir).write_table(table, rows)
-    write_atomically(described, dump_yaml(chosen.of_a_run()))
+    write_table(table, rows)
+    write_atomically(described, dump_yaml(_described(chosen, trained.algorithm.iteration)))
     return table

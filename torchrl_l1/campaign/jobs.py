@@ -11,9 +11,9 @@ from pathlib import Path
 from torchrl_l1.campaign.evaluation import is_evaluated
 from torchrl_l1.campaign.launcher import side_by_side, sweep
 from torchrl_l1.campaign.progress import Progress
-from torchrl_l1.campaign.runs import PlannedRun, quoted
+from torchrl_l1.campaign.runs import PlannedRun
 from torchrl_l1.campaign.settings import Campaign
-from torchrl_l1.campaign.workers import Failure, Job, Workers
+from torchrl_l1.campaign.workers import Failure, Job, Unfinished, Workers
 
 
 def work_on_runs(runs: Sequence[PlannedRun], workers: int) -> list[Failure]:
@@ -39,11 +39,11 @@ def work_on_runs(runs: Sequence[PlannedRun], workers: int) -> list[Failure]:
 
     def training(run: PlannedRun) -> Job:
         def done() -> Iterable[Job]:
+            _check_finished([run])
             progress.finished(run)
             return evaluations(run)
 
-        run_dir = f"run_dir={quoted(run.directory.path)}"
-        command = _child("run", run.recipe, *run.overrides, run_dir, "--resume")
+        command = _child("train", json.dumps({**run.settings(), "resume": True}))
         return Job(str(run), command, _log(run), run.directory.held, done)
 
     finished = [run for run in runs if run.finished()]
@@ -71,7 +71,7 @@ def launch_runs(
         settings: overrides of Hydra's own settings.
 
     Returns:
-        the sweeps that failed.
+        the sweeps that failed, or that left runs unfinished.
     """
     progress = Progress(runs)
     unfinished = sorted({run.matrix for run in runs if not run.finished()})
@@ -81,8 +81,9 @@ def launch_runs(
         command = _child(*sweep(matrix, output, launcher, workers, settings, logs=str(index)))
         log = output / "launcher" / f"{index}.log"
 
-        def done(recipe: str = matrix.recipe) -> Iterable[Job]:
-            progress.write(f"finished the sweep of {recipe}")
+        def done(index: int = index) -> Iterable[Job]:
+            _check_finished([run for run in runs if run.matrix == index])
+            progress.write(f"finished the sweep of {campaign.runs[index].recipe}")
             return []
 
         jobs.append(Job(f"sweep {index} ({matrix.recipe})", command, log, _never, done))
@@ -99,6 +100,13 @@ def _work(jobs: Sequence[Job], workers: int, progress: Progress) -> list[Failure
         return pool.work(jobs)
     finally:
         progress.close()
+
+
+def _check_finished(runs: Sequence[PlannedRun]) -> None:
+    problems = [problem for problem in (run.problem() for run in runs) if problem]
+    if problems:
+        count = f"{len(problems)} of {len(runs)} runs are not as planned: " if len(runs) > 1 else ""
+        raise Unfinished(count + problems[0])
 
 
 def _child(*arguments: str) -> list[str]:

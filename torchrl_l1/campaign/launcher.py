@@ -23,11 +23,14 @@ _WORKERS = {"joblib": "n_jobs", "submitit_slurm": "array_parallelism"}
 
 
 def check_launcher(launcher: str) -> None:
-    """Make sure that a launcher is installed.
+    """Make sure that a launcher exists and is installed.
 
     Raises:
-        CampaignError: if it is not, with the command that installs it.
+        CampaignError: if it is not, with the launchers that there are or the command that
+            installs it.
     """
+    if launcher not in LAUNCHERS:
+        raise CampaignError(f"unknown launcher {launcher!r}; there are {', '.join(LAUNCHERS)}")
     if launcher not in _PLUGINS:
         return
     module, extra = _PLUGINS[launcher]
@@ -93,6 +96,11 @@ def sweep(
         *parallel,
         *settings,
     ]
+
+
+def elsewhere(launcher: str) -> bool:
+    """Whether runs may go to other machines."""
+    return launcher in ("submitit_slurm", "ray")
 
 
 def side_by_side(launcher: str) -> bool:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_l1.algorithms.device import resolve_device
 from torchrl_l1.campaign.runs import PlannedRun, quoted, recipe_name
 from torchrl_l1.campaign.settings import (
     Campaign,
@@ -26,11 +27,16 @@ from torchrl_l1.experiment.schema import METRPORecipe, l1_config
 from torchrl_l1.experiment.tracking import check_mode
 
 
-def plan(campaign: Campaign, output: Path) -> list[PlannedRun]:
+def plan(campaign: Campaign, output: Path, elsewhere: bool = False) -> list[PlannedRun]:
     """All runs of a campaign, in the order in which they are to be started.
 
     The first seed of every cell comes before the second of any, so that a campaign that is
     stopped early has compared everything with everything.
+
+    Args:
+        campaign: the campaign.
+        output: its folder.
+        elsewhere: whether its runs go to other machines, with other devices than this one's.
 
     Raises:
         CampaignError: for an unknown recipe or option, a setting out of range, an evaluation that
@@ -52,6 +58,8 @@ def plan(campaign: Campaign, output: Path) -> list[PlannedRun]:
     _add_evaluations(campaign, runs)
     for run in runs:
         run.check_directory()
+    if not elsewhere:
+        _check_devices(campaign, runs)
     return sorted(runs, key=lambda run: run.round)
 
 
@@ -74,8 +82,6 @@ def _runs(index: int, matrix: RunMatrix, output: Path) -> Iterator[PlannedRun]:
             own.seed = seed
             own.run_dir = str(folder / f"seed_{seed}")
             yield PlannedRun(
-                recipe,
-                [*matrix.overrides, *place, f"seed={seed}"],
                 {"recipe": recipe_name(recipe), **cell, "seed": str(seed)},
                 index,
                 round_,
@@ -92,6 +98,16 @@ def _check(config: DictConfig) -> None:
     l1_config(recipe.l1, recipe.task)
     compile_mode(recipe.l1.compile)
     check_mode(recipe.wandb.mode)
+
+
+def _check_devices(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
+    for run in runs:
+        if run.finished():
+            continue  # evaluations need no other device than the CPU
+        try:
+            resolve_device(run.config.device)
+        except ValueError as error:
+            raise CampaignError(f"{campaign.file}: runs[{run.matrix}]: {error}") from error
 
 
 def _add_evaluations(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:

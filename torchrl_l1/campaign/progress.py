@@ -57,25 +57,30 @@ def result(run: PlannedRun) -> str:
 
 
 class Progress:
-    """A bar over the outer iterations of all runs, which reads the runs' own tables.
+    """A bar over the real steps of all runs, which reads the runs' own tables.
+
+    Iterations of different tasks take different times; time goes more with the real steps.
 
     Args:
         runs: all runs of the campaign.
     """
 
     def __init__(self, runs: Sequence[PlannedRun]) -> None:
-        self._done = {id(run): run.iterations_done() for run in runs}
         self._runs = runs
+        self._done = {id(run): run.iterations_done() for run in runs}
+        self._steps = {id(run): run.steps_per_iteration for run in runs}
         self._ended = {id(run) for run in runs if run.finished()}
         self._to_evaluate = sum(not _is_evaluated(run) for run in runs)
         self._start = time.monotonic()
-        self._first = sum(self._done.values())
+        self._first = self._steps_done()
+        self._total = sum(run.iterations * self._steps[id(run)] for run in runs)
         self._next = 0.0
-        # No smoothing: iterations of different tasks take different times, the mean is steadier.
+        # No smoothing: steps of different tasks take different times, the mean is steadier.
         self._bar = tqdm(
-            total=sum(run.iterations for run in runs),
+            total=self._total,
             initial=self._first,
-            unit="iteration",
+            unit="step",
+            unit_scale=True,
             smoothing=0,
             disable=None,
         )
@@ -89,7 +94,7 @@ class Progress:
             if self._done[id(run)] < run.iterations:
                 self._done[id(run)] = run.iterations_done()
         self._bar.set_postfix_str(f"{running} running, {self._to_evaluate} to evaluate")
-        self._bar.update(sum(self._done.values()) - self._bar.n)
+        self._bar.update(self._steps_done() - self._bar.n)
 
     def write(self, line: str) -> None:
         """Print a line above the bar."""
@@ -111,9 +116,12 @@ class Progress:
         """Leave the bar as it is."""
         self._bar.close()
 
+    def _steps_done(self) -> int:
+        return sum(count * self._steps[key] for key, count in self._done.items())
+
     def _time_left(self) -> str:
-        done = sum(self._done.values())
-        left = sum(run.iterations for run in self._runs) - done
+        done = self._steps_done()
+        left = self._total - done
         if left == 0 or done == self._first:
             return ""
         seconds = (time.monotonic() - self._start) * left / (done - self._first)

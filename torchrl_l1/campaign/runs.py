@@ -9,6 +9,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_l1.campaign.settings import EvaluationSettings
+from torchrl_l1.envs import get_task
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
 
 
@@ -17,8 +18,6 @@ class PlannedRun:
     """One run of a campaign.
 
     Attributes:
-        recipe: as ``torchrl-l1 run`` takes it.
-        overrides: all but the run directory.
         values: the run's place in the matrix, as texts, with ``recipe``.
         matrix: the position of its matrix in the campaign.
         round: the position of its seed in the matrix.
@@ -27,8 +26,6 @@ class PlannedRun:
         evaluations: what is to be evaluated once it is finished.
     """
 
-    recipe: str
-    overrides: list[str]
     values: dict[str, str]
     matrix: int
     round: int
@@ -46,19 +43,25 @@ class PlannedRun:
         """Outer iterations in all."""
         return int(self.config.outer_iterations)
 
+    @property
+    def steps_per_iteration(self) -> int:
+        """Real steps that an outer iteration collects."""
+        config = self.config
+        full = config.horizon or get_task(config.task).horizon
+        return int(config.episodes_per_iteration * min(config.episode_steps or full, full))
+
     def iterations_done(self) -> int:
         """Outer iterations so far; all of them only once the run is sure to be finished."""
-        if not self.directory.checkpoint_file.exists():
-            return 0
-        try:
-            text = self.directory.metrics_file.read_text(encoding="utf-8")
-        except FileNotFoundError:
-            return 0
-        return min(max(len(text.splitlines()) - 1, 0), self.iterations)
+        return min(self.directory.iterations_done(), self.iterations)
 
     def finished(self) -> bool:
         """Whether all outer iterations are done."""
         return self.iterations_done() >= self.iterations
+
+    def settings(self) -> dict[str, Any]:
+        """The configuration as plain dictionaries, lists and values."""
+        settings: Any = OmegaConf.to_container(self.config, resolve=True, throw_on_missing=True)
+        return {str(key): value for key, value in settings.items()}
 
     def check_directory(self) -> None:
         """Make sure that the run directory, if it holds a run, holds this one.
@@ -68,14 +71,23 @@ class PlannedRun:
         """
         if not self.directory.config_file.exists():
             return
-        settings: Any = OmegaConf.to_container(self.config, resolve=True, throw_on_missing=True)
         try:
-            self.directory.check_same(settings)
+            self.directory.check_same(self.settings())
         except RunDirectoryError as error:
             raise RunDirectoryError(
-                f"{error}\nThe campaign was started with other settings; with --output it gets a "
-                "folder of its own."
+                f"{error}\nThe campaign or its recipe has changed since that run was started; with "
+                "--output the campaign gets a folder of its own."
             ) from error
+
+    def problem(self) -> str | None:
+        """What keeps the run from being finished as planned; ``None`` if it is."""
+        if not self.finished():
+            return f"{self} has {self.iterations_done()} of {self.iterations} iterations"
+        try:
+            self.check_directory()
+        except RunDirectoryError as error:
+            return str(error)
+        return None
 
 
 def recipe_name(recipe: str) -> str:

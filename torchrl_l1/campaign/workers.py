@@ -27,7 +27,8 @@ class Job:
         command: what is started.
         log: file that its output is appended to.
         held: whether a process that is not ours is at the same work now.
-        done: called once it has ended well; what it gives is started next.
+        done: called once it has ended well; what it gives is started next. It may raise
+            :class:`Unfinished`.
     """
 
     name: str
@@ -37,24 +38,27 @@ class Job:
     done: Callable[[], Iterable[Job]]
 
 
+class Unfinished(Exception):
+    """A process has ended well, but its work is not done; the message says what is wrong."""
+
+
 @dataclass
 class Failure:
     """A job that ended badly.
 
     Attributes:
         job: which.
-        status: its exit status, negative for a signal.
+        how: how it ended.
     """
 
     job: Job
-    status: int
+    how: str
 
     def __str__(self) -> str:
-        """Name, status and the end of the log."""
-        how = f"signal {-self.status}" if self.status < 0 else f"status {self.status}"
+        """Name, how it ended, and the end of the log."""
         lines = self.job.log.read_text(encoding="utf-8", errors="replace").splitlines()
         tail = "\n".join(f"    {line}" for line in lines[-_LAST_LINES:])
-        return f"{self.job.name} ended with {how}; the end of {self.job.log}:\n{tail}"
+        return f"{self.job.name} {self.how}; the end of {self.job.log}:\n{tail}"
 
 
 class Stopped(Exception):
@@ -67,6 +71,9 @@ class Stopped(Exception):
 
 class Workers:
     """Runs jobs, ``count`` at a time, in the calling thread.
+
+    A process that ends with the status ``EX_TEMPFAIL`` has found another one at its work; it is
+    started again once that has ended.
 
     Each process has one thread and a session of its own, so that a Ctrl-C reaches the campaign
     alone, which then ends them. It must be the main thread: on Linux the system ends the
@@ -144,12 +151,16 @@ class Workers:
             if status is None:
                 continue
             self._running.remove(entry)
-            if status == 0:
-                self._queue.extendleft(reversed(list(job.done())))
-            elif job.held():
-                self._queue.append(job)  # another process was quicker; wait for it
+            if status == os.EX_TEMPFAIL:
+                self._queue.append(job)
+            elif status != 0:
+                how = f"signal {-status}" if status < 0 else f"status {status}"
+                self._failures.append(Failure(job, f"ended with {how}"))
             else:
-                self._failures.append(Failure(job, status))
+                try:
+                    self._queue.extendleft(reversed(list(job.done())))
+                except Unfinished as error:
+                    self._failures.append(Failure(job, f"ended well, but {error}"))
 
     def _end_all(self) -> None:
         for _, process in self._running:

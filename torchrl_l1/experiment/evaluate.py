@@ -17,6 +17,7 @@ from torchrl_l1.algorithms.collection import (
     signal_metrics,
 )
 from torchrl_l1.algorithms.metrpo import METRPO
+from torchrl_l1.experiment.l1_options import closest_option
 from torchrl_l1.experiment.recipes import shared_dir
 from torchrl_l1.experiment.run import build
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
@@ -101,7 +102,8 @@ def evaluate(
     """Returns of a frozen policy, one row per condition.
 
     Every condition sees the same resets and the same random numbers. Model and policy are
-    those of the run's last checkpoint.
+    those of the run's last checkpoint. ``own_l1`` is 1 where the controller is the one that the
+    run was trained with, else 0.
     """
     for cell in cells:
         collection = make_collection(trained, cell, episodes, epsilon)
@@ -110,6 +112,7 @@ def evaluate(
             "run": str(trained.path),
             "training_seed": trained.recipe.seed,
             **vars(cell),
+            "own_l1": int(_tested_l1(trained, cell.l1, epsilon) == trained.recipe.l1),
             **return_metrics(data),
             **signal_metrics(data),
         }
@@ -119,8 +122,7 @@ def make_collection(
     trained: TrainedRun, cell: Condition, episodes: int, epsilon: float | None = None
 ) -> Collection:
     """The environments of one condition around the frozen policy and model."""
-    settings = L1Settings(**group_setting("l1", cell.l1))
-    settings.epsilon = trained.recipe.l1.epsilon if epsilon is None else epsilon
+    settings = _tested_l1(trained, cell.l1, epsilon)
     perturbation = Perturbation(
         **group_setting("noise", cell.noise), actuator_bias=cell.bias, actuator_gain=cell.gain
     )
@@ -133,3 +135,16 @@ def make_collection(
         perturbation,
         trained.recipe.horizon,
     )
+
+
+def _tested_l1(trained: TrainedRun, option: str, epsilon: float | None) -> L1Settings:
+    """The controller of a test.
+
+    Where the option is the one that the run was trained with, however it was tuned, it is the
+    run's own. Any other is as shipped, with the run's epsilon.
+    """
+    own = trained.recipe.l1
+    epsilon = own.epsilon if epsilon is None else epsilon
+    if option == closest_option(own, trained.recipe.task):
+        return replace(own, epsilon=epsilon)
+    return replace(L1Settings(**group_setting("l1", option)), epsilon=epsilon)

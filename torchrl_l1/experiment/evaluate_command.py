@@ -18,7 +18,7 @@ from torchrl_l1.experiment.evaluate import (
 )
 from torchrl_l1.experiment.filmstrip import write_filmstrip
 from torchrl_l1.experiment.robustness import plot_robustness, summarize, table
-from torchrl_l1.experiment.run_directory import RunDirectory
+from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.experiment.schema import METRPORecipe, WandbSettings
 
 
@@ -59,8 +59,8 @@ def evaluate_command(options: argparse.Namespace) -> None:
     output.mkdir(parents=True, exist_ok=True)
     summary = summarize(rows)
     print(table(summary))
-    RunDirectory(output).write_table(output / "evaluation.csv", rows)
-    RunDirectory(output).write_table(output / "summary.csv", summary)
+    write_table(output / "evaluation.csv", rows)
+    write_table(output / "summary.csv", summary)
     plot_robustness(summary, output / "robustness.png", title=runs[0].recipe.recipe)
     print(f"Table: {output / 'evaluation.csv'}, {output / 'summary.csv'}")
     print(f"Plot: {output / 'robustness.png'}")

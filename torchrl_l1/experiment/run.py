@@ -14,9 +14,10 @@ from tqdm import tqdm
 
 from torchrl_l1.algorithms import METRPO
 from torchrl_l1.control.compilation import CompileMode
-from torchrl_l1.experiment.run_directory import RunDirectory, save_atomically, versions
+from torchrl_l1.experiment.run_directory import RunDirectory, save_atomically, write_table
 from torchrl_l1.experiment.schema import METRPORecipe, algorithm_config, l1_config
 from torchrl_l1.experiment.tracking import Tracker, check_mode
+from torchrl_l1.experiment.versions import versions
 
 
 def run(config: DictConfig) -> Path:
@@ -95,8 +96,9 @@ def _run(
         algorithm.load_state_dict(checkpoint["algorithm"])
         rows, timings = checkpoint["metrics"], checkpoint["timings"]
         progress.update(len(rows))
-        directory.write_table(directory.metrics_file, rows)
-        directory.write_table(directory.timing_file, timings)
+        if directory.iterations_done() < len(rows):
+            # A kill has come between the checkpoint and the files made from it.
+            _write_results(algorithm, directory, rows, timings)
         if len(rows) >= recipe.outer_iterations:
             progress.write(f"{directory.path} is complete: nothing to do")
             return
@@ -118,10 +120,7 @@ def _run(
             directory.save_checkpoint(
                 {"algorithm": algorithm.state_dict(), "metrics": rows, "timings": timings}
             )
-            directory.write_table(directory.metrics_file, rows)
-            directory.write_table(directory.timing_file, timings)
-            save_atomically(directory.path / "model.pt", algorithm.dynamics.state_dict())
-            save_atomically(directory.path / "policy.pt", algorithm.policy.state_dict())
+            _write_results(algorithm, directory, rows, timings)
             tracker.log(rows[-1], timings[-1])
             progress.update()
             progress.write(
@@ -129,3 +128,16 @@ def _run(
                 f"return {result.metrics['return_mean']:.2f} "
                 f"(deterministic {result.metrics['return_deterministic']:.2f})"
             )
+
+
+def _write_results(
+    algorithm: METRPO,
+    directory: RunDirectory,
+    rows: list[dict[str, Any]],
+    timings: list[dict[str, Any]],
+) -> None:
+    save_atomically(directory.path / "model.pt", algorithm.dynamics.state_dict())
+    save_atomically(directory.path / "policy.pt", algorithm.policy.state_dict())
+    write_table(directory.timing_file, timings)
+    # Last: whoever finds the last row takes the run for finished and never comes back to it.
+    write_table(directory.metrics_file, rows)

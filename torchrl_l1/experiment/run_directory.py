@@ -7,20 +7,16 @@ import fcntl
 import io
 import json
 import os
-import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import torch
 from omegaconf import OmegaConf
 
-from torchrl_l1.experiment.schema import VOLATILE_KEYS
-
-PACKAGES = ("torchrl-l1", "torch", "tensordict", "torchrl", "gymnasium", "mujoco", "numpy")
-
+from torchrl_l1.experiment.schema import VOLATILE_KEYS, flatten, schema_defaults
+from torchrl_l1.experiment.versions import versions
 
 # What a run killed in its first moments may leave behind; its directory is still free.
 _BEFORE_CONFIG = (".lock", "versions.json", "versions.json.tmp", "config.yaml.tmp")
@@ -33,13 +29,18 @@ class RunDirectoryError(Exception):
     """The run directory cannot be used as asked; the message says why and what to do."""
 
 
+class RunDirectoryInUse(RunDirectoryError):
+    """Another process is running in the run directory."""
+
+
 class RunDirectory:
     """Files of one run.
 
     ``config.yaml`` (resolved), ``versions.json``, ``metrics.csv`` (one row per outer iteration,
     the source of truth), ``timing.csv`` (wall-clock seconds by phase), ``checkpoint.pt``,
-    ``model.pt``, ``policy.pt``, and W&B's own files. All are replaced atomically; the CSVs are
-    rewritten from the checkpoint's rows when a run resumes.
+    ``model.pt``, ``policy.pt``, and W&B's own files. All are replaced atomically, the checkpoint
+    first and the metrics last, so that a row of the metrics says that its iteration is complete.
+    Where a row is missing, all are made again from the checkpoint when the run resumes.
 
     Args:
         path: the directory.
@@ -58,8 +59,8 @@ class RunDirectory:
 
         Raises:
             RunDirectoryError: if it holds a run and ``resume`` is not set, if that run has
-                another configuration, or if another process is running in it. Nothing is
-                changed in these cases.
+                another configuration, or (:class:`RunDirectoryInUse`) if another process is
+                running in it. Nothing is changed in these cases.
         """
         if self.config_file.exists():
             if not resume:
@@ -77,7 +78,7 @@ class RunDirectory:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
-                raise RunDirectoryError(f"another process is running in {self.path}") from error
+                raise RunDirectoryInUse(f"another process is running in {self.path}") from error
             if not self.config_file.exists():
                 write_atomically(self.path / "versions.json", json.dumps(versions(), indent=2))
             if self._stored().get(_MAY_GROW) != config.get(_MAY_GROW) or not resume:
@@ -106,10 +107,14 @@ class RunDirectory:
     def check_same(self, config: dict[str, Any]) -> None:
         """Compare ``config`` with that of the run that the directory holds.
 
+        Settings that the run does not mention, since it is older than they are, have the
+        schema's defaults.
+
         Raises:
             RunDirectoryError: if a setting differs that touches the result.
         """
-        before, now = _flatten(self._stored()), _flatten(config)
+        before, now = flatten(self._stored()), flatten(config)
+        before = {k: v for k, v in schema_defaults().items() if k in now} | before
         if before.get(_MAY_GROW, 0) < now.get(_MAY_GROW, 0):
             before[_MAY_GROW] = now[_MAY_GROW]
         different = [
@@ -124,6 +129,16 @@ class RunDirectory:
                 + "\nGive the same settings, or another run_dir."
             )
 
+    def iterations_done(self) -> int:
+        """Outer iterations that are complete: the rows of the metrics."""
+        if not self.checkpoint_file.exists():
+            return 0
+        try:
+            text = self.metrics_file.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            return 0
+        return max(len(text.splitlines()) - 1, 0)
+
     def save_checkpoint(self, state: dict[str, Any]) -> None:
         """Replace the checkpoint; a kill at any moment leaves the old or the new one."""
         save_atomically(self.checkpoint_file, state)
@@ -137,34 +152,15 @@ class RunDirectory:
         )
         return state
 
-    def write_table(self, file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Write a whole CSV atomically; columns in order of first appearance."""
-        columns = list(dict.fromkeys(key for row in rows for key in row))
-        text = io.StringIO()
-        writer = csv.DictWriter(text, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-        write_atomically(file, text.getvalue())
 
-
-def _flatten(node: Any, prefix: str = "") -> dict[str, Any]:
-    if not isinstance(node, dict):
-        return {prefix: node}
-    flat: dict[str, Any] = {}
-    for key, value in node.items():
-        flat.update(_flatten(value, f"{prefix}.{key}" if prefix else str(key)))
-    return flat
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python, the platform and the packages that a result depends on."""
-    found = {"python": platform.python_version(), "platform": platform.platform()}
-    for package in PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed"
-    return found
+def write_table(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write a whole CSV atomically; columns in order of first appearance."""
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomically(file, text.getvalue())
 
 
 def write_atomically(file: Path, text: str) -> None:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from functools import cache
+from typing import Any
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING
+from omegaconf import MISSING, OmegaConf
 
 from torchrl_l1.algorithms import METRPOConfig, Perturbation
+from torchrl_l1.algorithms.device import DEVICES
+from torchrl_l1.algorithms.metrpo_config import check_clipping
 from torchrl_l1.control import L1Config
 from torchrl_l1.envs import get_task
 
@@ -88,10 +93,37 @@ class RunSettings:
     perturbation: Perturbation = field(default_factory=Perturbation)
     wandb: WandbSettings = field(default_factory=WandbSettings)
 
+    def __post_init__(self) -> None:
+        """Refuse settings that could only fail later.
+
+        Whether there is a CUDA device is not asked here: a run that was trained on one may be
+        read anywhere.
+
+        Raises:
+            ValueError: naming the setting.
+        """
+        if self.device not in DEVICES:
+            raise ValueError(f"device must be {' or '.join(DEVICES)}, got {self.device!r}")
+        for name in ("threads", "published_horizon"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.horizon is not None and self.horizon < 1:
+            raise ValueError(f"horizon must be at least 1 or null, got {self.horizon}")
+
 
 @dataclass
 class METRPORecipe(RunSettings, METRPOConfig):
     """A METRPO recipe: run settings and the algorithm's own, side by side."""
+
+    def __post_init__(self) -> None:
+        """Check both parts, and that they fit each other.
+
+        Raises:
+            ValueError: naming the setting.
+        """
+        RunSettings.__post_init__(self)
+        METRPOConfig.__post_init__(self)
+        check_clipping(self.clip_actions, self.l1.enabled)
 
 
 # Keys that may differ between a run and its continuation: they do not touch the result.
@@ -101,6 +133,28 @@ VOLATILE_KEYS = ("run_dir", "resume", "wandb")
 def register() -> None:
     """Make the schemas known to Hydra."""
     ConfigStore.instance().store(name="metrpo_recipe", node=METRPORecipe)
+
+
+def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested settings by dotted key.
+
+    Examples:
+        >>> flatten({"l1": {"alpha": 0.1}, "seed": 3})
+        {'l1.alpha': 0.1, 'seed': 3}
+    """
+    if not isinstance(node, Mapping):
+        return {prefix: node}
+    flat: dict[str, Any] = {}
+    for key, value in node.items():
+        flat.update(flatten(value, f"{prefix}.{key}" if prefix else str(key)))
+    return flat
+
+
+@cache
+def schema_defaults() -> Mapping[str, Any]:
+    """Every key of the schema that has a default, dotted, with that default."""
+    node = OmegaConf.to_container(OmegaConf.structured(METRPORecipe))
+    return {key: value for key, value in flatten(node).items() if value != MISSING}
 
 
 def algorithm_config(recipe: METRPORecipe) -> METRPOConfig:

@@ -8,9 +8,9 @@ from pathlib import Path
 from torchrl_l1.experiment.run_directory import write_atomically
 from torchrl_l1.report.campaigns import find_campaigns
 from torchrl_l1.report.evaluation_sections import evaluation_sections
+from torchrl_l1.report.finding import Findings, find_readable_runs
 from torchrl_l1.report.page import Page
 from torchrl_l1.report.reference_curves import ReferenceCurves
-from torchrl_l1.report.runs import find_runs
 from torchrl_l1.report.training_sections import training_sections
 from torchrl_l1.report.training_tables import run_rows
 from torchrl_l1.report.variants import Study
@@ -23,7 +23,8 @@ def report(
 ) -> Path:
     """Write tables, figures and a page of all runs in or below some folders.
 
-    Everything is read before anything is written.
+    Everything is read before anything is written. Files that cannot be read are left out, and
+    the page lists them.
 
     Args:
         folders: where to look.
@@ -35,7 +36,7 @@ def report(
 
     Raises:
         FileNotFoundError: if a folder or file does not exist, or no run is found.
-        RunDirectoryError: if a run's files cannot be read.
+        RunDirectoryError: if no run can be read.
         ValueError: if the output folder is a run directory, or the curves cannot be read.
     """
     output = folders[0] / "report" if output is None else output
@@ -44,13 +45,14 @@ def report(
     if output.exists() and not output.is_dir():
         raise ValueError(f"--output {output} is a file; give a folder")
     reference = None if reference_curves is None else ReferenceCurves(reference_curves)
-    runs = find_runs(folders)
+    found = find_readable_runs(folders)
+    runs = found.runs
     campaigns = find_campaigns(folders, runs)
     study = Study(runs)
     output.mkdir(parents=True, exist_ok=True)
 
     page = Page(output)
-    _introduction(page, study, _command(folders, output, reference_curves))
+    _introduction(page, study, found, _command(folders, output, reference_curves))
     page.campaigns(campaigns)
     training_sections(page, study, reference)
     evaluation_sections(page, study)
@@ -61,7 +63,7 @@ def report(
     return file
 
 
-def _introduction(page: Page, study: Study, command: str) -> None:
+def _introduction(page: Page, study: Study, found: Findings, command: str) -> None:
     unfinished = sum(not run.finished for run in study.runs)
     page.text(
         f"{len(study.runs)} runs, of which {len(study.runs) - unfinished} are finished; only "
@@ -72,7 +74,13 @@ def _introduction(page: Page, study: Study, command: str) -> None:
     page.csv("runs", run_rows(study))
     if study.duplicates:
         left_out = "\n".join(f"- {run.path}" for run in study.duplicates)
-        page.text(f"Left out, since another run has the same settings and seed:\n\n{left_out}")
+        page.text(
+            "Left out, since another run has the same settings and seed (what it was evaluated in "
+            f"and the other was not counts for the other):\n\n{left_out}"
+        )
+    if found.errors:
+        errors = "\n".join(f"- {error}" for error in found.errors)
+        page.text(f"Left out, since they cannot be read:\n\n{errors}")
 
 
 def _command(folders: Sequence[Path], output: Path, reference_curves: Path | None) -> str:

@@ -59,7 +59,7 @@ def _bar(axis: Axes, x: float, row: Row, shade: str) -> None:
 
 
 def plot_disturbances(rows: Sequence[Row], heading: str, file: Path) -> Path | None:
-    """Return against actuator bias and against actuator gain, with bootstrap intervals.
+    """Return against actuator bias and against actuator gain, with 95 % intervals of the mean.
 
     Args:
         rows: of one training cell, tested under several biases and gains.

@@ -10,7 +10,7 @@ import numpy as np
 from torchrl_l1.report.published import published_cell
 from torchrl_l1.report.runs import Evaluation, Run
 from torchrl_l1.report.settings import BASELINE
-from torchrl_l1.report.statistics import bootstrap_interval
+from torchrl_l1.report.statistics import mean_interval
 from torchrl_l1.report.training_tables import difference_summary
 from torchrl_l1.report.variants import Study, noise_order, variant_text
 
@@ -20,6 +20,8 @@ PHASES = ("neither", "training only", "testing only", "both")
 """Where L1 is on, in the order in which tables and figures show it."""
 
 _CONDITION = ("l1", "noise", "bias", "gain", "policy")
+
+Key = tuple[Any, ...]
 
 
 def evaluation_names(study: Study) -> list[str]:
@@ -32,15 +34,17 @@ def evaluation_rows(study: Study, name: str) -> list[dict[str, Any]]:
 
     ``return_values`` holds the mean returns of the single training seeds, ``std`` is their
     population standard deviation (as in the paper's tables), and the differences are those to
-    the same policies tested without L1. Runs that are not finished are left out.
+    the same policies tested without L1. Runs that are not finished are left out. Where ``l1``
+    is equal to ``training_l1`` the policy was tested with the controller of its training;
+    another controller of that name is marked.
     """
     rows = []
     for cell, runs in study.cells.items():
         done = [run for run in runs if run.finished and name in run.evaluations]
-        tests: dict[tuple[Any, ...], list[tuple[Run, Evaluation]]] = {}
+        tests: dict[Key, list[tuple[Run, Evaluation]]] = {}
         for run in done:
             for test in run.evaluations[name]:
-                key = tuple(getattr(test, field) for field in _CONDITION)
+                key = (_tested(run, test), *test.condition[1:])
                 tests.setdefault(key, []).append((run, test))
         for key in sorted(tests, key=_order):
             rows.append(
@@ -61,14 +65,15 @@ def evaluation_rows(study: Study, name: str) -> list[dict[str, Any]]:
 def ablation_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Those rows of an evaluation that the ablation is made of, with the ``phase`` of L1.
 
-    The test has the noise of the training, and L1 is on in both phases, in one, or in neither.
-    Where L1 is on in both it is the same L1.
+    The test has the noise of the training and no disturbance, and L1 is on in both phases, in
+    one, or in neither. Where L1 is on in both it is the same L1.
     """
     chosen = []
     for row in rows:
         trained, tested = row["training_l1"], row["l1"]
         on = {trained, tested} - {BASELINE}
-        if row["training_noise"] == row["noise"] and len(on) < 2:
+        undisturbed = (row["bias"], row["gain"]) == (0.0, 1.0)
+        if undisturbed and row["training_noise"] == row["noise"] and len(on) < 2:
             chosen.append({**row, "phase": phase(trained, tested)})
     return sorted(chosen, key=lambda row: PHASES.index(row["phase"]))
 
@@ -80,6 +85,18 @@ def phase(trained: str, tested: str) -> str:
     return "training only" if tested == BASELINE else "both"
 
 
+def _tested(run: Run, test: Evaluation) -> str:
+    """The controller of a test: the training's L1 setting if it is that of the training."""
+    what = run.identity
+    if BASELINE in (what.arm, test.l1):
+        return test.l1
+    # Older tables were made with the options as shipped.
+    own = test.l1 == what.shipped if test.own_l1 is None else test.own_l1
+    if own:
+        return what.arm
+    return f"{test.l1} (not as trained)" if test.l1 == what.arm else test.l1
+
+
 def _summary(tests: Sequence[tuple[Run, Evaluation]]) -> dict[str, Any]:
     values = [test.return_mean for _, test in tests]
     result: dict[str, Any] = {
@@ -89,14 +106,14 @@ def _summary(tests: Sequence[tuple[Run, Evaluation]]) -> dict[str, Any]:
         "std": float(np.std(values)),
         "return_values": " ".join(f"{value:.6g}" for value in values),
     }
-    interval = bootstrap_interval(values)
+    interval = mean_interval(values)
     if interval is not None:
         result |= {"return_low": interval.low, "return_high": interval.high}
     return result
 
 
 def _against_baseline(
-    key: tuple[Any, ...], tests: Mapping[tuple[Any, ...], Sequence[tuple[Run, Evaluation]]]
+    key: Key, tests: Mapping[Key, Sequence[tuple[Run, Evaluation]]]
 ) -> dict[str, Any]:
     if key[0] == BASELINE:
         return {}
@@ -106,15 +123,18 @@ def _against_baseline(
     )
 
 
-def _published(run: Run, key: tuple[Any, ...]) -> dict[str, str]:
+def _published(run: Run, key: Key) -> dict[str, str]:
     l1, noise, bias, gain, policy = key
     what = run.identity
     if (bias, gain, policy) != (0.0, 1.0, "stochastic") or what.model_form == "affine":
+        return {}
+    if what.departures:
+        # The paper's L1 is the shipped one.
         return {}
     cell = published_cell(what.task, what.noise, what.arm, noise, l1)
     return {} if cell is None else cell.columns()
 
 
-def _order(key: tuple[Any, ...]) -> tuple[Any, ...]:
+def _order(key: Key) -> Key:
     l1, noise, bias, gain, policy = key
     return policy != "stochastic", noise_order(noise), bias, gain, l1 != BASELINE, l1

@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.report.campaigns import CampaignState
 from torchrl_l1.report.runs import Run
-from torchrl_l1.report.tables import markdown, write_csv
+from torchrl_l1.report.tables import markdown
 
 __all__ = ["Page", "slug"]
 
@@ -39,7 +40,7 @@ class Page:
     def csv(self, name: str, rows: Sequence[Row]) -> None:
         """Write a table in full precision and name it."""
         file = self.folder / f"{name}.csv"
-        write_csv(file, rows)
+        write_table(file, rows)
         self.text(f"All columns: [{file.name}]({file.name}).")
 
     def figure(self, file: Path | None, caption: str) -> None:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,16 +14,33 @@ import yaml  # type: ignore[import-untyped]
 from omegaconf import OmegaConf
 
 from torchrl_l1.experiment.run_directory import RunDirectoryError
+from torchrl_l1.report.numeric_csv import numeric_rows
 
-__all__ = ["Evaluation", "read_config", "read_evaluations", "read_metrics", "read_versions"]
+__all__ = [
+    "SIGNALS",
+    "Evaluation",
+    "read_config",
+    "read_evaluations",
+    "read_metrics",
+    "read_training_seconds",
+    "read_versions",
+]
+
+SIGNALS = ("l1/switch_rate", "l1/u_a", "l1/saturation")
+"""Columns of a metrics table that only runs with L1 have."""
 
 _METRICS = ("iteration", "real_steps", "return_mean", "return_deterministic")
 _NUMBERS = ("bias", "gain", "return_mean", "episodes")
+_TRAINING_PHASES = ("random", "fit", "trpo", "collect")
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Returns of a run's frozen policy under one condition, see ``torchrl-l1 evaluate``."""
+    """Returns of a run's frozen policy under one condition, see ``torchrl-l1 evaluate``.
+
+    ``own_l1`` tells whether the controller was the one of the training; ``None`` in tables that
+    are older than this column.
+    """
 
     l1: str
     noise: str
@@ -33,6 +49,12 @@ class Evaluation:
     policy: str
     return_mean: float
     episodes: int
+    own_l1: bool | None = None
+
+    @property
+    def condition(self) -> tuple[Any, ...]:
+        """What was tested: equal for repetitions."""
+        return self.l1, self.noise, self.bias, self.gain, self.policy
 
 
 def read_config(file: Path) -> dict[str, Any]:
@@ -45,14 +67,22 @@ def read_config(file: Path) -> dict[str, Any]:
 
 
 def read_metrics(file: Path) -> dict[str, np.ndarray]:
-    """Columns of a metrics table; empty ones for a run that has only just begun."""
-    if not file.exists():
-        return {name: np.empty(0) for name in _METRICS}
-    rows = list(_numeric_rows(file, _METRICS))
-    columns = {name: np.array([row[name] for row in rows]) for name in _METRICS}
+    """Columns of a metrics table; empty ones for a run that has only just begun.
+
+    Those of :data:`SIGNALS` are NaN where the run has none.
+    """
+    rows = _rows(file, _METRICS, optional=SIGNALS) if file.exists() else []
+    columns = {name: np.array([row[name] for row in rows]) for name in (*_METRICS, *SIGNALS)}
     if not np.array_equal(columns["iteration"], np.arange(len(rows))):
         raise RunDirectoryError(f"{file}: the iterations are not 0, 1, 2, ... without a gap")
     return columns
+
+
+def read_training_seconds(file: Path, iterations: int) -> np.ndarray:
+    """Seconds of fit, TRPO and collection in each iteration; NaN where they are not known."""
+    rows = _rows(file, ("iteration",), optional=_TRAINING_PHASES) if file.exists() else []
+    seconds = {int(row["iteration"]): sum(row[k] for k in _TRAINING_PHASES) for row in rows}
+    return np.array([seconds.get(index, np.nan) for index in range(iterations)])
 
 
 def read_evaluations(file: Path) -> list[Evaluation]:
@@ -61,39 +91,19 @@ def read_evaluations(file: Path) -> list[Evaluation]:
         Evaluation(
             row["l1"], row["noise"], row["bias"], row["gain"], row["policy"],
             row["return_mean"], int(row["episodes"]),
+            None if math.isnan(row["own_l1"]) else bool(row["own_l1"]),
         )
-        for row in _numeric_rows(file, _NUMBERS, ("l1", "noise", "policy"))
+        for row in _rows(file, _NUMBERS, ("l1", "noise", "policy"), optional=("own_l1",))
     ]  # fmt: skip
 
 
-def _numeric_rows(
-    file: Path, numbers: Sequence[str], words: Sequence[str] = ()
-) -> Iterator[dict[str, Any]]:
+def _rows(
+    file: Path, numbers: Sequence[str], words: Sequence[str] = (), optional: Sequence[str] = ()
+) -> list[dict[str, Any]]:
     try:
-        with file.open(newline="", encoding="utf-8") as handle:
-            reader = csv.DictReader(handle, strict=True)
-            missing = [k for k in (*numbers, *words) if k not in (reader.fieldnames or ())]
-            if missing:
-                raise RunDirectoryError(f"{file} has no column {', '.join(missing)}")
-            rows = list(reader)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise RunDirectoryError(f"cannot read {file}: {error}") from error
-    for line, row in enumerate(rows, start=2):
-        for key in words:
-            if not row[key]:
-                raise RunDirectoryError(f"{file}, line {line}: {key} is empty")
-        values: dict[str, Any] = {key: row[key] for key in words}
-        for key in numbers:
-            try:
-                values[key] = float(row[key])
-            except (TypeError, ValueError):
-                values[key] = math.nan
-            if not math.isfinite(values[key]):
-                raise RunDirectoryError(
-                    f"{file}, line {line}: {key} is {row[key]!r}, not a finite number. Move the "
-                    "run directory away, or run it again"
-                )
-        yield values
+        return numeric_rows(file, numbers, words, optional)
+    except ValueError as error:
+        raise RunDirectoryError(f"{error}. Move the run directory away, or run it again") from error
 
 
 def read_versions(file: Path) -> dict[str, str]:

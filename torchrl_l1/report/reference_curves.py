@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from torchrl_l1.report.numeric_csv import numeric_rows
 from torchrl_l1.report.settings import BASELINE
 
 __all__ = ["Curves", "ReferenceCurves"]
@@ -51,26 +50,18 @@ class ReferenceCurves:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if a column is missing, a value is no number, a setting is unknown, or the
-            seeds of a setting differ in length.
+        ValueError: if a column is missing, a value is empty or no number, a setting is unknown,
+            or the seeds of a setting differ in length.
     """
 
     def __init__(self, path: Path) -> None:
         if not path.is_file():
             raise FileNotFoundError(f"no reference curves at {path}")
         runs: dict[tuple[str, str], dict[str, list[tuple[float, float]]]] = {}
-        with path.open(newline="", encoding="utf-8") as handle:
-            reader = csv.DictReader(handle)
-            missing = [key for key in COLUMNS if key not in (reader.fieldnames or ())]
-            if missing:
-                raise ValueError(f"{path} has no column {', '.join(missing)}")
-            for line, row in enumerate(reader, start=2):
-                point = (_number(path, line, row, k) for k in COLUMNS[-2:])
-                steps, value = point
-                seeds = runs.setdefault((row["arm"], row["setting"]), {})
-                seeds.setdefault(row["seed"], []).append(
-                    (steps * _STEPS_PER_TRAINING_SAMPLE, value)
-                )
+        for row in numeric_rows(path, COLUMNS[-2:], COLUMNS[:-2]):
+            seeds = runs.setdefault((row["arm"], row["setting"]), {})
+            steps = row["total_train_samples"] * _STEPS_PER_TRAINING_SAMPLE
+            seeds.setdefault(row["seed"], []).append((steps, row["average_return"]))
         self._curves: dict[tuple[str, str, bool, str], Curves] = {}
         for (arm, setting), seeds in runs.items():
             if len({len(points) for points in seeds.values()}) != 1:
@@ -85,16 +76,6 @@ class ReferenceCurves:
     def model_form(self, task: str, form: str) -> Curves | None:
         """The curves behind figure 2, ``nonlinear`` or ``affine``."""
         return self._curves.get((task, "none", False, form))
-
-
-def _number(path: Path, line: int, row: dict[str, str], key: str) -> float:
-    try:
-        value = float(row[key])
-    except (TypeError, ValueError):
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(f"{path}, line {line}: {key} is {row[key]!r}, not a finite number")
-    return value
 
 
 def _meaning(path: Path, arm: str, setting: str) -> tuple[str, str, bool, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torchrl_l1.report.evaluation_tables import PHASES
@@ -12,14 +12,9 @@ from torchrl_l1.report.tables import Footnotes, interval_text, markdown, number
 __all__ = ["ablation_table", "evaluation_table", "paired_table", "training_table"]
 
 Row = Mapping[str, Any]
-Describe = Callable[[Row], str]
 
 
-def _variant(row: Row) -> str:
-    return str(row["variant"])
-
-
-def training_table(rows: Sequence[Row], variant: Describe = _variant) -> str:
+def training_table(rows: Sequence[Row]) -> str:
     """The paper's Table 1, ours beside it, with footnotes to its cells."""
     notes = Footnotes()
     lines = [
@@ -27,13 +22,17 @@ def training_table(rows: Sequence[Row], variant: Describe = _variant) -> str:
             "task": row["task"],
             "noise": row["noise"],
             "L1": row["l1"],
-            "variant": variant(row),
+            "variant": row["variant"],
             "return ± spread": _spread(row.get("return_mean"), row.get("published_spread")),
             "95 % interval": _interval(row, "return"),
             "with the mean action": number(row.get("deterministic_mean")),
             "95 % interval of it": _interval(row, "deterministic"),
             "seeds": str(row["seeds"]),
             "real steps": str(row.get("real_steps", "–")),
+            "switches per 1000 steps": number(row.get("switches_per_1000")),
+            "L1 input": number(row.get("u_a")),
+            "saturation": number(row.get("saturation")),
+            "ms per step": number(row.get("ms_per_step")),
             "paper": _paper(row, notes),
             "authors' logs": _spread(row.get("authors_mean"), row.get("authors_spread")),
             "unfinished": row["unfinished"],
@@ -140,7 +139,7 @@ def _difference(row: Row) -> dict[str, str]:
     return {
         "mean difference": "–" if few else number(row["difference_mean"]),
         "95 % interval": _interval(row, "difference"),
-        "interquartile mean": "–" if few else number(row["iqm"]),
+        "interquartile mean": number(row.get("iqm")),
         "95 % interval of it": _interval(row, "iqm"),
         "differences": ", ".join(number(float(value)) for value in values) if few else "",
     }

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import Any
 
 from omegaconf import OmegaConf
 
+from torchrl_l1.control.config import DEFAULT_ALPHA
+from torchrl_l1.experiment.l1_options import closest_option, departures, filter_gain
 from torchrl_l1.experiment.recipes import shared_dir
-from torchrl_l1.experiment.schema import VOLATILE_KEYS, METRPORecipe
+from torchrl_l1.experiment.schema import VOLATILE_KEYS, L1Settings, flatten, schema_defaults
 
-__all__ = ["BASELINE", "NOISES", "TASKS", "Identity", "identify"]
+__all__ = ["BASELINE", "NOISES", "Identity", "identify"]
 
 BASELINE = "off"
 """Name of the arm without L1."""
@@ -20,11 +22,10 @@ BASELINE = "off"
 NOISES = ("none", "action", "observation", "both")
 """Noise settings in the order in which tables and figures show them."""
 
-TASKS = ("inverted_pendulum", "swimmer", "hopper", "walker", "half_cheetah")
-"""Tasks in the order of the paper's tables; others come after them."""
-
 # Keys that tell runs apart in other ways, or that do not touch the result.
 _NOT_COMPARED = (*VOLATILE_KEYS, "seed", "task", "threads", "device", "l1.compile")
+# Two ways to give the gain of the filter, which is compared under the first of these names.
+_FILTER_KEYS = ("l1.alpha", "l1.cutoff")
 _NOISE_KEYS = ("perturbation.action_noise", "perturbation.observation_noise")
 
 
@@ -35,11 +36,17 @@ class Identity:
     Attributes:
         task: such as ``half_cheetah``.
         noise: option of the ``noise`` group that its noise is equal to, else the noise in words.
-        arm: ``off``, or the option of the ``l1`` group that its controller is closest to.
+        arm: ``off``, or the option of the ``l1`` group that its controller is closest to,
+            whatever the gain of its filter.
         seed: its seed.
         outer_iterations: the number of rows of a finished run.
         shared: settings that both arms have, key by key, as text.
-        l1: settings of the controller as text; none for the baseline.
+        l1: settings of the controller as text; none for the baseline. ``l1.alpha`` is the gain
+            of the filter, however it was given.
+        departures: those in which the controller departs from the option ``arm`` as shipped;
+            epsilon does not count.
+        shipped: the option that the controller is equal to but for epsilon; empty if there is
+            none.
     """
 
     task: str
@@ -49,6 +56,8 @@ class Identity:
     outer_iterations: int
     shared: Mapping[str, str]
     l1: Mapping[str, str]
+    departures: Mapping[str, str]
+    shipped: str
 
     @property
     def model_form(self) -> str:
@@ -66,57 +75,44 @@ def identify(config: Mapping[str, Any]) -> Identity:
         KeyError: if it lacks a key that every run has.
         ValueError: if such a key has no usable value.
     """
-    settings = {**schema_defaults(), **_flatten(config)}
+    settings = {**schema_defaults(), **flatten(config)}
     for key in ("task", "seed", "outer_iterations"):
         if settings.get(key) in (None, "???"):
             raise KeyError(f"the configuration has no {key}")
-    arm = _arm(settings)
+    task = str(settings["task"])
+    controller = L1Settings(**{f.name: settings[f"l1.{f.name}"] for f in fields(L1Settings)})
+    arm = closest_option(controller, task, by_filter=False)
+    closest = closest_option(controller, task)
     compared = {
         key: _text(value)
         for key, value in settings.items()
-        if key not in (*_NOT_COMPARED, *_NOISE_KEYS) and key.split(".")[0] not in VOLATILE_KEYS
+        if key not in (*_NOT_COMPARED, *_NOISE_KEYS, *_FILTER_KEYS)
+        and key.split(".")[0] not in VOLATILE_KEYS
     }
+    l1 = {k: v for k, v in compared.items() if k.startswith("l1.")}
+    on = arm != BASELINE
+    departed = departures(controller, arm, task) if on else {}
     return Identity(
-        task=str(settings["task"]),
+        task=task,
         noise=_noise(settings),
         arm=arm,
         seed=int(settings["seed"]),
         outer_iterations=int(settings["outer_iterations"]),
-        shared={k: v for k, v in compared.items() if not k.startswith("l1.")},
-        l1={k: v for k, v in compared.items() if k.startswith("l1.") and arm != BASELINE},
+        shared={k: v for k, v in compared.items() if k not in l1},
+        l1={**l1, _FILTER_KEYS[0]: _text(filter_gain(controller, task))} if on else {},
+        departures={f"l1.{key}": _text(value) for key, value in departed.items()},
+        shipped="" if on and departures(controller, closest, task) else closest,
     )
-
-
-@cache
-def schema_defaults() -> dict[str, Any]:
-    """Every key of the recipe schema that has a default, dotted, with that default."""
-    node = OmegaConf.to_container(OmegaConf.structured(METRPORecipe))
-    return {key: value for key, value in _flatten(node).items() if value != "???"}
 
 
 def default_text(key: str) -> str | None:
     """A key's default as :class:`Identity` writes values; ``None`` if the schema has none."""
-    defaults = schema_defaults()
+    defaults = {**schema_defaults(), _FILTER_KEYS[0]: DEFAULT_ALPHA}
     return _text(defaults[key]) if key in defaults else None
 
 
-def _arm(settings: Mapping[str, Any]) -> str:
-    if not settings.get("l1.enabled"):
-        return BASELINE
-
-    def distance(option: str) -> int:
-        full = {k: v for k, v in schema_defaults().items() if k.startswith("l1.")}
-        full |= {f"l1.{key}": value for key, value in _group("l1")[option].items()}
-        tuned = ("l1.epsilon", "l1.compile")
-        return sum(settings.get(k) != v for k, v in full.items() if k not in tuned)
-
-    options = [name for name, values in _group("l1").items() if values.get("enabled")]
-    # The first of equals: the paper's controller is what a user's own departs from.
-    return min(sorted(options, key=lambda name: name != "paper"), key=distance)
-
-
 def _noise(settings: Mapping[str, Any]) -> str:
-    for name, values in _group("noise").items():
+    for name, values in _noises().items():
         if all(settings.get(f"perturbation.{key}") == value for key, value in values.items()):
             return name
     action, observation = (settings.get(key) for key in _NOISE_KEYS)
@@ -124,22 +120,9 @@ def _noise(settings: Mapping[str, Any]) -> str:
 
 
 @cache
-def _group(group: str) -> dict[str, dict[str, Any]]:
-    found: dict[str, dict[str, Any]] = {}
-    for file in sorted((shared_dir() / group).glob("*.yaml")):
-        found[file.stem] = _flatten(OmegaConf.to_container(OmegaConf.load(file)))
-    return found
-
-
-def _flatten(node: Any, prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in node.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, Mapping):
-            flat |= _flatten(value, f"{name}.")
-        else:
-            flat[name] = value
-    return flat
+def _noises() -> dict[str, dict[str, Any]]:
+    files = sorted((shared_dir() / "noise").glob("*.yaml"))
+    return {file.stem: flatten(OmegaConf.to_container(OmegaConf.load(file))) for file in files}
 
 
 def _text(value: Any) -> str:

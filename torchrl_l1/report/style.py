@@ -31,13 +31,6 @@ __all__ = [
 _ARMS = {"off": "#D55E00", "paper": "#0072B2", "reference": "#009E73", "slow": "#CC79A7"}
 _CYCLE = ("#D55E00", "#0072B2", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#000000")
 
-_NAMES = {
-    "inverted_pendulum": "Inverted pendulum",
-    "swimmer": "Swimmer",
-    "hopper": "Hopper",
-    "walker": "Walker",
-    "half_cheetah": "HalfCheetah",
-}
 _NOISES = {
     "none": "no noise",
     "action": "action noise",
@@ -57,8 +50,13 @@ def arm_label(arm: str) -> str:
 
 
 def title(task: str, noise: str | None = None) -> str:
-    """A task's name in headings, with its noise."""
-    name = _NAMES.get(task, task)
+    """A task's name in headings, with its noise.
+
+    Examples:
+        >>> title("half_cheetah", "action")
+        'Half cheetah, action noise'
+    """
+    name = task.replace("_", " ").capitalize()
     return name if noise is None else f"{name}, {noise_words(noise)}"
 
 

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
 
-from torchrl_l1.experiment.run_directory import write_atomically
-
-__all__ = ["Footnotes", "interval_text", "markdown", "number", "write_csv"]
+__all__ = ["Footnotes", "interval_text", "markdown", "number"]
 
 
 def number(value: float | None) -> str:
@@ -37,21 +31,16 @@ def interval_text(low: float | None, high: float | None) -> str:
 
 
 def markdown(rows: Sequence[Mapping[str, str]]) -> str:
-    """A Markdown table; the keys of the rows are its header. Columns without content go."""
+    """A Markdown table; the keys of the rows are its header. Columns without content go.
+
+    Without rows it is empty.
+    """
+    if not rows:
+        return ""
     columns = [key for key in rows[0] if any(row[key] not in ("", "–") for row in rows)]
     lines = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
     lines += [f"| {' | '.join(row[key] for key in columns)} |" for row in rows]
     return "\n".join(lines)
-
-
-def write_csv(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a table atomically; columns in order of first appearance."""
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomically(file, text.getvalue())
 
 
 class Footnotes:

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from torchrl_l1.report.learning_curves import plot_comparison, plot_task
 from torchrl_l1.report.page import Page, slug
 from torchrl_l1.report.reference_curves import ReferenceCurves
 from torchrl_l1.report.rendering import paired_table, training_table
 from torchrl_l1.report.style import title
 from torchrl_l1.report.training_tables import paired_rows, training_row
-from torchrl_l1.report.variants import Study, variant_text
+from torchrl_l1.report.variants import Study
 
 __all__ = ["training_sections"]
-
-Row = Mapping[str, Any]
 
 
 def training_sections(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
@@ -32,8 +27,10 @@ def _training(page: Page, study: Study, reference: ReferenceCurves | None) -> No
         "Training",
         "Return is the mean over seeds of the mean over the last three outer iterations, of "
         "sampled actions as in the paper; the spread is the paper's ± (standard deviation over "
-        "seeds in each of these iterations, averaged), the interval a bootstrap of the mean over "
-        "seeds.",
+        "seeds in each of these iterations, averaged), the interval that of the mean over seeds. "
+        "What L1 did (switches, mean norm of its input, share of actions that a bound cut) and "
+        "training time per real step, without the episodes that only measure returns, are means "
+        "over the same iterations.",
     )
     page.text(training_table([row for cell, row in rows.items() if not cell.variant]))
     page.text(_main_settings(study))
@@ -50,6 +47,8 @@ def _main_settings(study: Study) -> str:
             for key, value in study.main_settings(task, cell.arm).items():
                 where = "" if key in shared else f" (L1 {cell.arm})"
                 settings[f"`{key}={value}`{where}"] = None
+            for key, value in study.cells[cell][0].identity.departures.items():
+                settings[f"`{key}={value}` (L1 {cell.arm})"] = None
         if settings:
             lines.append(f"- {task}: {', '.join(settings)}")
     if not lines:
@@ -64,8 +63,9 @@ def _pairs(page: Page, study: Study) -> None:
     page.heading(
         "L1 less baseline",
         "Differences of the same return between runs of the same seed and settings with and "
-        "without L1: an interval that holds 0 shows no clear effect; fewer than three pairs are "
-        "shown as they are.",
+        "without L1, with 95 % intervals; the interquartile mean takes five pairs, and fewer than "
+        "three are shown as they are. With a handful of seeds a single one may move an interval "
+        "to either side of 0.",
     )
     page.text(paired_table(rows))
     page.csv("pairs", rows)
@@ -85,17 +85,6 @@ def _curves(page: Page, study: Study, reference: ReferenceCurves | None) -> None
 def _comparisons(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
     for keys in study.comparisons():
         cells = study.compared(keys)
-        texts = {variant_text(c.variant): study.describe(c, keys) for c in cells if c.variant}
-        main = {(c.task, c.noise, c.arm): study.describe(c, keys) for c in cells if not c.variant}
-
-        def variant(
-            row: Row,
-            texts: Mapping[str, str] = texts,
-            main: Mapping[tuple[str, str, str], str] = main,
-        ) -> str:
-            own = texts.get(row["variant"])
-            return main[row["task"], row["noise"], row["l1"]] if own is None else own
-
         page.heading(
             f"By {' and '.join(f'`{key}`' for key in keys)}",
             "The same table for runs that depart from the main ones in these settings, and the "
@@ -103,8 +92,12 @@ def _comparisons(page: Page, study: Study, reference: ReferenceCurves | None) ->
             + " It is the comparison of the paper's Figure 2."
             * ("model.form" in keys),
         )
-        rows = [training_row(cell, study.cells[cell], reference) for cell in cells]
-        page.text(training_table(rows, variant))
+        rows = [
+            training_row(cell, study.cells[cell], reference)
+            | {"variant": study.describe(cell, keys)}
+            for cell in cells
+        ]
+        page.text(training_table(rows))
         for task in dict.fromkeys(cell.task for cell in cells):
             name = page.folder / f"by_{slug(keys)}_{task}.png"
             figure = plot_comparison(study, task, keys, name, reference)

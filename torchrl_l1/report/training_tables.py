@@ -12,9 +12,10 @@ from torchrl_l1.report.reference_curves import ReferenceCurves
 from torchrl_l1.report.runs import Run
 from torchrl_l1.report.settings import BASELINE
 from torchrl_l1.report.statistics import (
-    bootstrap_interval,
     final_return,
+    interquartile_interval,
     interquartile_mean,
+    mean_interval,
     published_spread,
 )
 from torchrl_l1.report.variants import Cell, Study, variant_text
@@ -33,6 +34,7 @@ def run_rows(study: Study) -> list[dict[str, Any]]:
             "real_steps": int(run.real_steps[-1]) if len(run.real_steps) else 0,
             "return": run.final if run.finished else None,
             "return_deterministic": run.final_deterministic if run.finished else None,
+            **(_signals([run]) if run.finished else {}),
             "path": str(run.path),
         }
         for cell, runs in study.cells.items()
@@ -56,12 +58,14 @@ def training_row(
             row["published_spread"] = published_spread(np.array([run.returns for run in done]))
         row |= _summary("deterministic", [run.final_deterministic for run in done])
         row["real_steps"] = round(float(np.mean([run.real_steps[-1] for run in done])))
+        row |= _signals(done)
     row["unfinished"] = "; ".join(
         f"seed {run.identity.seed}: {run.progress} iterations" for run in runs if not run.finished
     )
-    affine = runs[0].identity.model_form == "affine"
+    what = runs[0].identity
+    affine = what.model_form == "affine"
     # The paper prints no returns with control-affine models; their curves are in its Figure 2.
-    published = None if affine else published_cell(*place, *place[1:])
+    published = None if affine or what.departures else published_cell(*place, *place[1:])
     if published is not None:
         row |= published.columns()
     curves = None
@@ -113,13 +117,13 @@ def paired_rows(study: Study) -> list[dict[str, Any]]:
 
 
 def difference_summary(differences: Sequence[float]) -> dict[str, Any]:
-    """Mean and interquartile mean with intervals; the differences themselves if they are few."""
+    """Mean and, of five or more, interquartile mean, with intervals; and the differences."""
     if not differences:
         return {}
     result = _summary("difference", differences)
-    result["iqm"] = float(interquartile_mean(differences))
-    interval = bootstrap_interval(differences, interquartile=True)
+    interval = interquartile_interval(differences)
     if interval is not None:
+        result["iqm"] = float(interquartile_mean(differences))
         result |= {"iqm_low": interval.low, "iqm_high": interval.high}
     result["differences"] = " ".join(f"{value:.6g}" for value in differences)
     return result
@@ -128,10 +132,22 @@ def difference_summary(differences: Sequence[float]) -> dict[str, Any]:
 def _summary(name: str, values: Sequence[float]) -> dict[str, Any]:
     """Mean and, of three values or more, its interval."""
     result = {f"{name}_mean": float(np.mean(values))}
-    interval = bootstrap_interval(values)
+    interval = mean_interval(values)
     if interval is not None:
         result |= {f"{name}_low": interval.low, f"{name}_high": interval.high}
     return result
+
+
+def _signals(runs: Sequence[Run]) -> dict[str, float]:
+    """What L1 did and what training took, over the last three iterations; what is known of it."""
+    values = {
+        "switches_per_1000": [1000 * run.final_signal("l1/switch_rate") for run in runs],
+        "u_a": [run.final_signal("l1/u_a") for run in runs],
+        "saturation": [run.final_signal("l1/saturation") for run in runs],
+        "ms_per_step": [run.milliseconds_per_step for run in runs],
+    }
+    means = {name: float(np.mean(numbers)) for name, numbers in values.items()}
+    return {name: mean for name, mean in means.items() if np.isfinite(mean)}
 
 
 def _place(cell: Cell) -> dict[str, Any]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from torchrl_l1.envs import TASKS
+from torchrl_l1.report.duplicates import distinct
 from torchrl_l1.report.runs import Run
-from torchrl_l1.report.settings import BASELINE, NOISES, TASKS, default_text
+from torchrl_l1.report.settings import BASELINE, NOISES, default_text
 
 __all__ = ["Cell", "Study", "variant_text"]
 
@@ -45,27 +47,23 @@ class Study:
 
     Args:
         runs: the runs, in any order. Of those with equal settings and seed the one that is
-            furthest stays, and the others go to :attr:`duplicates`.
+            furthest stays, with the evaluations of all that are as far, and the others go to
+            :attr:`duplicates`.
     """
 
     def __init__(self, runs: Sequence[Run]) -> None:
-        self.duplicates: list[Run] = []
-        unique: dict[tuple[object, ...], Run] = {}
-        for run in runs:
-            key = (*_pairing_key(run), run.identity.arm, _frozen(run.identity.l1))
-            best = unique.setdefault(key, run)
-            if best is not run:
-                better, worse = (run, best) if len(run.returns) > len(best.returns) else (best, run)
-                unique[key] = better
-                self.duplicates.append(worse)
-        self.runs = list(unique.values())
+        self.runs, self.duplicates = distinct(
+            runs, lambda run: (*_pairing_key(run), run.identity.arm, _frozen(run.identity.l1))
+        )
         self._main: dict[tuple[str, str], dict[str, str]] = {}
         for task in {run.identity.task for run in self.runs}:
             members = [run for run in self.runs if run.identity.task == task]
-            self._main[task, ""] = _main_settings(members, [r.identity.shared for r in members])
+            main = self._main[task, ""] = _main_settings(members, _shared)
             for arm in {run.identity.arm for run in members}:
                 same = [run for run in members if run.identity.arm == arm]
-                self._main[task, arm] = _main_settings(same, [r.identity.l1 for r in same])
+                # Chosen from all of them, no run might have both, and the task no main cell.
+                usual = [run for run in same if main == _values(_shared(run), main)]
+                self._main[task, arm] = _main_settings(same, lambda run: run.identity.l1, usual)
         self.cells: dict[Cell, list[Run]] = {}
         for run in sorted(self.runs, key=lambda run: run.identity.seed):
             self.cells.setdefault(self.cell(run), []).append(run)
@@ -76,8 +74,7 @@ class Study:
         what = run.identity
         settings = {**what.shared, **what.l1}
         main = self.main_settings(what.task, what.arm)
-        variant = tuple((k, settings.get(k, "(absent)")) for k in main)
-        departing = tuple((k, v) for k, v in variant if v != main[k])
+        departing = tuple((k, v) for k, v in _values(settings, main).items() if v != main[k])
         return Cell(what.task, what.noise, what.arm, departing)
 
     def main_settings(self, task: str, arm: str = BASELINE) -> dict[str, str]:
@@ -129,17 +126,33 @@ def _frozen(settings: Mapping[str, str]) -> frozenset[tuple[str, str]]:
     return frozenset(settings.items())
 
 
-def _main_settings(runs: Sequence[Run], settings: Sequence[Mapping[str, str]]) -> dict[str, str]:
-    """Of the settings that differ, the combination that covers most of a task."""
-    every = dict.fromkeys(key for one in settings for key in one)
-    keys = [key for key in every if len({one.get(key, "(absent)") for one in settings}) > 1]
-    combinations = [tuple(one.get(key, "(absent)") for key in keys) for one in settings]
+def _shared(run: Run) -> Mapping[str, str]:
+    return run.identity.shared
+
+
+def _values(settings: Mapping[str, str], keys: Iterable[str]) -> dict[str, str]:
+    return {key: settings.get(key, "(absent)") for key in keys}
+
+
+def _main_settings(
+    runs: Sequence[Run],
+    settings: Callable[[Run], Mapping[str, str]],
+    candidates: Sequence[Run] = (),
+) -> dict[str, str]:
+    """Of the settings that differ, the combination that covers most of a task.
+
+    Only combinations of the candidates count, or of all runs where there are none.
+    """
+    every = dict.fromkeys(key for run in runs for key in settings(run))
+    keys = [key for key in every if len({settings(run).get(key) for run in runs}) > 1]
+    chosen = candidates or runs
+    combinations = [tuple(_values(settings(run), keys).values()) for run in chosen]
     numbers = Counter(combinations)
     places = Counter(
         combination
         for combination, _, _ in {
             (combination, run.identity.noise, run.identity.arm)
-            for combination, run in zip(combinations, runs, strict=True)
+            for combination, run in zip(combinations, chosen, strict=True)
         }
     )
 
@@ -157,7 +170,7 @@ def noise_order(noise: str) -> tuple[int, str]:
 
 
 def _order(cell: Cell) -> tuple[object, ...]:
-    task, noise = _place(TASKS, cell.task), noise_order(cell.noise)
+    task, noise = _place(list(TASKS), cell.task), noise_order(cell.noise)
     variant = tuple((key, _number_first(value)) for key, value in cell.variant)
     return task, noise, cell.arm != BASELINE, cell.arm, len(variant), variant
 

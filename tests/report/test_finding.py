@@ -1,12 +1,13 @@
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from torchrl_l1.experiment.run_directory import RunDirectoryError
-from torchrl_l1.report.runs import find_runs
+from torchrl_l1.report.finding import find_readable_runs, find_runs
 
 WriteRun = Callable[..., Path]
 
@@ -16,7 +17,9 @@ def test_identity_comes_from_the_configuration(write_run: WriteRun, tmp_path: Pa
         write_run([1], "l1=off"): ("none", "off"),
         write_run([1], "l1=paper", "noise=action"): ("action", "paper"),
         write_run([1], "l1=reference", "noise=both"): ("both", "reference"),
-        write_run([1], "l1=slow", "noise=observation"): ("observation", "slow"),
+        write_run([1], "l1=slow", "noise=observation"): ("observation", "paper"),
+        write_run([1], "l1=paper", "l1.alpha=0.1"): ("none", "paper"),
+        write_run([1], "l1=reference", "l1.cutoff=1"): ("none", "reference"),
         write_run([1], "l1=paper", "l1.epsilon=7"): ("none", "paper"),
         write_run([1], "l1=paper", "l1.on_switch=reset"): ("none", "paper"),
         write_run([1], "perturbation.action_noise=0.3"): ("action 0.3, observation 0", "paper"),
@@ -24,6 +27,26 @@ def test_identity_comes_from_the_configuration(write_run: WriteRun, tmp_path: Pa
     runs = {run.path: run.identity for run in find_runs([tmp_path])}
     assert {path: (what.noise, what.arm) for path, what in runs.items()} == expected
     assert {what.task for what in runs.values()} == {"inverted_pendulum"}
+
+
+def test_equal_filters_are_equal_however_they_are_given(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    # The pendulum's step takes 0.04 s.
+    default = ("", "l1.alpha=0.35", "l1.cutoff=8.75")
+    slow = ("l1.alpha=0.1", "l1.cutoff=2.5", "l1=slow")
+    gains = {}
+    for text, given in (("0.35", default), ("0.1", slow)):
+        for overrides in given:
+            gains[write_run([1], "l1=paper", *filter(None, [overrides]))] = text
+    runs = find_runs([tmp_path])
+    assert {run.path: run.identity.l1["l1.alpha"] for run in runs} == gains
+    assert all("l1.cutoff" not in run.identity.l1 for run in runs)
+    assert len({tuple(sorted(run.identity.l1.items())) for run in runs}) == 2
+    shipped = {gains[run.path]: run.identity.shipped for run in runs}
+    assert shipped == {"0.35": "paper", "0.1": "slow"}
+    departures = {gains[run.path]: dict(run.identity.departures) for run in runs}
+    assert departures == {"0.35": {}, "0.1": {"l1.alpha": "0.1"}}
 
 
 def test_settings_that_do_not_touch_the_result_are_left_out(
@@ -103,6 +126,63 @@ def test_a_corrupt_file_is_named(
         find_runs([tmp_path])
     assert str(run / file) in str(error.value)
     assert message in str(error.value)
+    if file in ("metrics.csv", "config.yaml"):
+        with pytest.raises(RunDirectoryError):
+            find_readable_runs([tmp_path])
+    else:
+        (run,) = find_readable_runs([tmp_path]).runs
+        assert run.final == -7.0
+
+
+def test_what_cannot_be_read_is_left_out_and_the_rest_stays(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    row = {"l1": "paper", "noise": "none", "bias": 0, "gain": 1, "policy": "stochastic"}
+    row |= {"return_mean": -1, "episodes": 25}
+    tests = {"ablation": [row], "mine": [row]}
+    good, partly, lost, broken = (write_run([-9, -7, -5], evaluations=tests) for _ in range(4))
+    spoil(partly / "evaluations" / "mine.csv", "-1", "inf")
+    spoil(lost / "metrics.csv", "-7.0", "nan")
+    spoil(broken / "config.yaml", "task:", "task: [")
+    found = find_readable_runs([tmp_path, good.parent])
+    assert {run.path: set(run.evaluations) for run in found.runs} == {
+        good: {"ablation", "mine"},
+        partly: {"ablation"},
+    }
+    assert len(found.errors) == 3
+    for error, file in zip(
+        found.errors,
+        (partly / "evaluations" / "mine.csv", lost / "metrics.csv", broken / "config.yaml"),
+        strict=True,
+    ):
+        assert str(file) in str(error)
+
+
+def test_signals_and_times_are_read_where_they_are(write_run: WriteRun, tmp_path: Path) -> None:
+    phases = ("random", "fit", "trpo", "collect", "evaluate")
+    timings = [
+        {"iteration": i, **dict.fromkeys(phases, 0.0), "fit": i, "trpo": 1.0, "evaluate": 1e6}
+        for i in range(5)
+    ]
+    signals = {"l1/switch_rate": [9, 9, 0.1, 0.2, 0.3], "l1/u_a": [9, 9, 1, 2, 6]}
+    signals["l1/saturation"] = [0, 0, 0, 0, float("nan")]
+    path = write_run([1] * 5, "l1=paper", signals=signals, timings=timings, steps=1000)
+    bare = write_run([1] * 5, "l1=off")
+    runs = {run.path: run for run in find_runs([tmp_path])}
+    assert runs[path].final_signal("l1/switch_rate") == pytest.approx(0.2)
+    assert runs[path].final_signal("l1/u_a") == pytest.approx(3.0)
+    # (2 + 1) + (3 + 1) + (4 + 1) seconds for 3000 steps.
+    assert runs[path].milliseconds_per_step == pytest.approx(4.0)
+    assert math.isnan(runs[path].final_signal("l1/saturation"))
+    assert math.isnan(runs[bare].final_signal("l1/u_a"))
+    assert math.isnan(runs[bare].milliseconds_per_step)
+
+
+def test_a_short_run_took_its_time_for_all_its_steps(write_run: WriteRun, tmp_path: Path) -> None:
+    timing = {"iteration": 0, "random": 1.0, "fit": 2.0, "trpo": 3.0, "collect": 4.0}
+    write_run([1], timings=[timing], steps=1000)
+    (run,) = find_runs([tmp_path])
+    assert run.milliseconds_per_step == pytest.approx(10 / 2000 * 1000)
 
 
 def test_nothing_to_report_is_refused(tmp_path: Path) -> None:

@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from omegaconf import DictConfig
+
+from torchrl_l1.control import L1Config, L1Transform
+from torchrl_l1.experiment.evaluate import Condition, evaluate, load_run, make_collection
+from torchrl_l1.experiment.l1_options import closest_option, departures, filter_gain, l1_options
+from torchrl_l1.experiment.run import run
+from torchrl_l1.experiment.schema import L1Settings
+
+Recipe = Callable[..., DictConfig]
+
+
+def test_shipped_options_are_closest_to_themselves() -> None:
+    assert set(l1_options()) >= {"off", "paper", "reference", "slow"}
+    for name, settings in l1_options().items():
+        assert closest_option(settings, "swimmer") == name
+        assert departures(settings, name, "swimmer") == {}
+
+
+@pytest.mark.parametrize(
+    ("settings", "by_filter", "without"),
+    [
+        ({"alpha": 0.1}, "slow", "paper"),
+        ({"alpha": 0.05}, "paper", "paper"),
+        ({"on_switch": "reset"}, "paper", "paper"),
+        ({"on_switch": "reset", "switch_on": "policy", "project": False}, "reference", "reference"),
+        ({"alpha": 0.1, "epsilon": 7.0, "compile": "auto"}, "slow", "paper"),
+    ],
+)
+def test_closest_option(settings: dict[str, object], by_filter: str, without: str) -> None:
+    own = L1Settings(enabled=True, **settings)  # type: ignore[arg-type]
+    assert closest_option(own, "hopper") == by_filter
+    assert closest_option(own, "hopper", by_filter=False) == without
+
+
+def test_cutoff_counts_by_the_gain_that_it_makes() -> None:
+    # Swimmer takes a step in 0.04 s, HalfCheetah in 0.05 s.
+    assert filter_gain(L1Settings(cutoff=7.0), "swimmer") == 0.28
+    assert filter_gain(L1Settings(cutoff=7.0), "half_cheetah") == 0.35
+    assert departures(L1Settings(cutoff=7.0), "paper", "half_cheetah") == {}
+
+
+def controller(*arguments: object) -> L1Config:
+    transforms = make_collection(*arguments).env.transform  # type: ignore[arg-type]
+    return next(one for one in transforms if isinstance(one, L1Transform)).config
+
+
+def test_a_run_is_tested_with_the_controller_it_was_trained_with(tiny_recipe: Recipe) -> None:
+    tuned = ("l1.alpha=0.2", "l1.a_s=-2", "l1.on_switch=reset", "l1.project=false")
+    trained = load_run(run(tiny_recipe("l1=paper", "l1.epsilon=0.5", *tuned)))
+    cells = [Condition(l1, "none", 0.0, 1.0, "stochastic") for l1 in ("off", "paper", "slow")]
+    assert [row["own_l1"] for row in evaluate(trained, cells, 2)] == [0, 1, 0]
+    assert [row["own_l1"] for row in evaluate(trained, cells, 2, epsilon=0.4)] == [0, 0, 0]
+    own, slow = (controller(trained, cell, 2) for cell in cells[1:])
+    assert (own.filter_gain, own.a_s, own.on_switch, own.project) == (0.2, -2.0, "reset", False)
+    assert (slow.filter_gain, slow.a_s, slow.on_switch, slow.project) == (0.1, -1.0, "keep", True)
+    assert own.epsilon == slow.epsilon == 0.5
+    assert controller(trained, cells[1], 2, 0.4).epsilon == 0.4

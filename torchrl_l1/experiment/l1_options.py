@@ -1,0 +1,98 @@
+"""The shipped options of the L1 controller, and which of them a run's own stands for."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from functools import cache
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from torchrl_l1.experiment.recipes import shared_dir
+from torchrl_l1.experiment.schema import L1Settings, l1_config
+
+__all__ = ["closest_option", "departures", "filter_gain", "l1_options"]
+
+# What runs are tuned by; it makes no other controller.
+_TUNED = ("enabled", "epsilon", "compile")
+# Two ways to give one number.
+_FILTER = ("alpha", "cutoff")
+
+
+@cache
+def l1_options() -> dict[str, L1Settings]:
+    """The options of the recipe group ``l1`` by name, ``off`` included.
+
+    Examples:
+        >>> l1_options()["slow"].alpha
+        0.1
+    """
+    return {
+        file.stem: L1Settings(**OmegaConf.to_container(OmegaConf.load(file)))  # type: ignore[arg-type]
+        for file in sorted((shared_dir() / "l1").glob("*.yaml"))
+    }
+
+
+def filter_gain(settings: L1Settings, task: str) -> float:
+    """Gain per step of the low-pass filter, however it was given.
+
+    Raises:
+        KeyError: for an unknown task, whose time step a ``cutoff`` needs.
+        ValueError: for settings that contradict each other.
+
+    Examples:
+        >>> filter_gain(L1Settings(), "inverted_pendulum")
+        0.35
+        >>> filter_gain(L1Settings(cutoff=8.75), "inverted_pendulum")
+        0.35
+    """
+    config = l1_config(replace(settings, enabled=True), task)
+    assert config is not None
+    # The product of cutoff and time step differs from a written alpha in its last digit.
+    return float(f"{config.filter_gain:.9g}")
+
+
+def departures(settings: L1Settings, option: str, task: str) -> dict[str, Any]:
+    """In what a controller departs from a shipped option, with its values.
+
+    Epsilon and compilation do not count, and the filter counts by its gain, as ``alpha``.
+
+    Examples:
+        >>> departures(L1Settings(enabled=True, cutoff=2.5), "paper", "inverted_pendulum")
+        {'alpha': 0.1}
+    """
+    shipped = l1_options()[option]
+    found = {
+        name: getattr(settings, name)
+        for name in (f.name for f in fields(L1Settings) if f.name not in (*_TUNED, *_FILTER))
+        if getattr(settings, name) != getattr(shipped, name)
+    }
+    gain = filter_gain(settings, task)
+    return found if gain == filter_gain(shipped, task) else {**found, "alpha": gain}
+
+
+def closest_option(settings: L1Settings, task: str, *, by_filter: bool = True) -> str:
+    """The shipped option that a controller departs least from.
+
+    Args:
+        settings: the controller's.
+        task: name of the task.
+        by_filter: whether the filter's gain tells options apart that are equal otherwise.
+
+    Examples:
+        >>> slow = L1Settings(enabled=True, alpha=0.1)
+        >>> closest_option(slow, "swimmer"), closest_option(slow, "swimmer", by_filter=False)
+        ('slow', 'paper')
+        >>> closest_option(L1Settings(), "swimmer")
+        'off'
+    """
+    if not settings.enabled:
+        return "off"
+
+    def distance(option: str) -> tuple[int, bool, bool]:
+        found = departures(settings, option, task)
+        filters = found.pop("alpha", None) is not None
+        # The first of equals: the paper's controller is what a user's own departs from.
+        return len(found), by_filter and filters, option != "paper"
+
+    return min((name for name, values in l1_options().items() if values.enabled), key=distance)
