@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from torchrl_l1.algorithms.collection import (
     Collection,
     Perturbation,
+    first_episodes,
     return_metrics,
     signal_metrics,
 )
@@ -114,7 +115,7 @@ def evaluate(
             **vars(cell),
             "own_l1": int(_tested_l1(trained, cell.l1, epsilon) == trained.recipe.l1),
             **return_metrics(data),
-            **signal_metrics(data),
+            **signal_metrics(first_episodes(data)),
         }
 
 
