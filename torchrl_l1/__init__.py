@@ -1,7 +1,7 @@
 """Robust model-based reinforcement learning with L1 adaptive control, for TorchRL.
 
 The names users compose are exported here; everything else lives in the sub-packages ``control``,
-``dynamics``, ``envs``, ``objectives``, ``algorithms`` and ``experiment``.
+``dynamics``, ``envs``, ``objectives``, ``algorithms``, ``experiment``, ``campaign`` and ``report``.
 """
 
 from torchrl_l1._version import __version__

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -13,9 +13,14 @@ __all__ = ["ActuatorBias", "ActuatorGain"]
 
 
 class _ActuatorDisturbance(Transform):
-    """An elementwise map of the action on its way to the base environment."""
+    """An elementwise map of the action on its way to the base environment.
+
+    Attributes:
+        disturb: the map, of the action and ``value``.
+    """
 
     value: Tensor
+    disturb: Callable[[Tensor, Tensor], Tensor]
 
     def __init__(self, value: float | Sequence[float], action_key: NestedKey) -> None:
         super().__init__()
@@ -28,9 +33,6 @@ class _ActuatorDisturbance(Transform):
         self.register_buffer("value", tensor)
         self.action_key = action_key
 
-    def _disturb(self, action: Tensor, value: Tensor) -> Tensor:
-        raise NotImplementedError
-
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get(self.action_key)
         if self.value.ndim and self.value.shape[-1] != action.shape[-1]:
@@ -38,7 +40,7 @@ class _ActuatorDisturbance(Transform):
                 f"{type(self).__name__} has {self.value.shape[-1]} values, but the action "
                 f"{self.action_key!r} has {action.shape[-1]} entries."
             )
-        return tensordict.set(self.action_key, self._disturb(action, self.value.to(action)))
+        return tensordict.set(self.action_key, self.disturb(action, self.value.to(action)))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Refuses to work on stored data.
@@ -77,11 +79,10 @@ class ActuatorBias(_ActuatorDisturbance):
         torch.Size([2, 3, 6])
     """
 
+    disturb = staticmethod(torch.add)
+
     def __init__(self, bias: float | Sequence[float], action_key: NestedKey = "action") -> None:
         super().__init__(bias, action_key)
-
-    def _disturb(self, action: Tensor, value: Tensor) -> Tensor:
-        return action + value
 
 
 class ActuatorGain(_ActuatorDisturbance):
@@ -97,8 +98,7 @@ class ActuatorGain(_ActuatorDisturbance):
         ValueError: if the gain is not finite or, at the first step, has the wrong length.
     """
 
+    disturb = staticmethod(torch.mul)
+
     def __init__(self, gain: float | Sequence[float], action_key: NestedKey = "action") -> None:
         super().__init__(gain, action_key)
-
-    def _disturb(self, action: Tensor, value: Tensor) -> Tensor:
-        return action * value
