@@ -19,8 +19,8 @@ from torchrl_l1.campaign.settings import (
 )
 from torchrl_l1.envs import get_task
 from torchrl_l1.experiment.errors import USER_ERRORS, message
-from torchrl_l1.experiment.evaluate import group_setting
 from torchrl_l1.experiment.launch import compose
+from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run import compile_mode
 from torchrl_l1.experiment.run_directory import RunDirectory
 from torchrl_l1.experiment.schema import METRPORecipe, l1_config

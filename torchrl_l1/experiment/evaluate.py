@@ -18,8 +18,8 @@ from torchrl_l1.algorithms.collection import (
     signal_metrics,
 )
 from torchrl_l1.algorithms.metrpo import METRPO
-from torchrl_l1.experiment.l1_options import closest_option
-from torchrl_l1.experiment.recipes import shared_dir
+from torchrl_l1.experiment.l1_options import closest_option, l1_option
+from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run import build
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
 from torchrl_l1.experiment.schema import L1Settings, METRPORecipe, l1_config
@@ -63,21 +63,6 @@ def load_run(path: str | Path) -> TrainedRun:
     algorithm = build(replace(recipe, device="cpu"))
     algorithm.load_state_dict({**checkpoint["algorithm"], "buffer": {}})
     return TrainedRun(directory.path, recipe, algorithm)
-
-
-def group_setting(group: str, name: str) -> dict[str, Any]:
-    """The values of a shared recipe group's option, such as ``l1`` and ``paper``.
-
-    Raises:
-        ValueError: if the option does not exist; the message lists those that do.
-    """
-    file = shared_dir() / group / f"{name}.yaml"
-    if not file.exists():
-        options = ", ".join(sorted(f.stem for f in file.parent.glob("*.yaml")))
-        raise ValueError(f"unknown {group} setting {name!r}; there are {options}")
-    values = OmegaConf.to_container(OmegaConf.load(file))
-    assert isinstance(values, dict)
-    return {str(key): value for key, value in values.items()}
 
 
 def conditions(
@@ -148,4 +133,4 @@ def _tested_l1(trained: TrainedRun, option: str, epsilon: float | None) -> L1Set
     epsilon = own.epsilon if epsilon is None else epsilon
     if option == closest_option(own, trained.recipe.task):
         return replace(own, epsilon=epsilon)
-    return replace(L1Settings(**group_setting("l1", option)), epsilon=epsilon)
+    return replace(l1_option(option), epsilon=epsilon)

@@ -13,10 +13,10 @@ from torchrl_l1.experiment.evaluate import (
     TrainedRun,
     conditions,
     evaluate,
-    group_setting,
     load_run,
 )
 from torchrl_l1.experiment.filmstrip import write_filmstrip
+from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.robustness import plot_robustness, summarize, table
 from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.experiment.schema import METRPORecipe, WandbSettings

@@ -6,12 +6,10 @@ from dataclasses import fields, replace
 from functools import cache
 from typing import Any
 
-from omegaconf import OmegaConf
-
-from torchrl_l1.experiment.recipes import shared_dir
+from torchrl_l1.experiment.recipes import group_options, group_setting
 from torchrl_l1.experiment.schema import L1Settings, l1_config
 
-__all__ = ["closest_option", "departures", "filter_gain", "l1_options"]
+__all__ = ["closest_option", "departures", "filter_gain", "l1_option", "l1_options"]
 
 # What runs are tuned by; it makes no other controller.
 _TUNED = ("enabled", "epsilon", "compile")
@@ -27,10 +25,16 @@ def l1_options() -> dict[str, L1Settings]:
         >>> l1_options()["slow"].alpha
         0.1
     """
-    return {
-        file.stem: L1Settings(**OmegaConf.to_container(OmegaConf.load(file)))  # type: ignore[arg-type]
-        for file in sorted((shared_dir() / "l1").glob("*.yaml"))
-    }
+    return {name: l1_option(name) for name in group_options("l1")}
+
+
+def l1_option(name: str) -> L1Settings:
+    """A shipped option of the recipe group ``l1``.
+
+    Raises:
+        ValueError: if it does not exist; the message lists those that do.
+    """
+    return L1Settings(**group_setting("l1", name))
 
 
 def filter_gain(settings: L1Settings, task: str) -> float:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
 
 import torchrl_l1
 
@@ -29,6 +32,26 @@ def recipes_dir() -> Path:
 def shared_dir() -> Path:
     """The folder of the groups that all algorithms share, such as ``l1`` and ``noise``."""
     return recipes_dir() / "shared"
+
+
+def group_options(group: str) -> list[str]:
+    """Names of the options of a group that all algorithms share."""
+    return sorted(file.stem for file in (shared_dir() / group).glob("*.yaml"))
+
+
+def group_setting(group: str, name: str) -> dict[str, Any]:
+    """The values of a shared recipe group's option, such as ``l1`` and ``paper``.
+
+    Raises:
+        ValueError: if the option does not exist; the message lists those that do.
+    """
+    file = shared_dir() / group / f"{name}.yaml"
+    if not file.exists():
+        options = ", ".join(group_options(group))
+        raise ValueError(f"unknown {group} setting {name!r}; there are {options}")
+    values = OmegaConf.to_container(OmegaConf.load(file))
+    assert isinstance(values, dict)
+    return {str(key): value for key, value in values.items()}
 
 
 def available_recipes() -> list[str]:
