@@ -13,16 +13,16 @@ __all__ = ["ActuatorBias", "ActuatorGain"]
 
 
 class _ActuatorDisturbance(Transform):
-    """An elementwise map of the action on its way to the base environment.
-
-    Attributes:
-        disturb: the map, of the action and ``value``.
-    """
+    """An elementwise map of the action on its way to the base environment."""
 
     value: Tensor
-    disturb: Callable[[Tensor, Tensor], Tensor]
 
-    def __init__(self, value: float | Sequence[float], action_key: NestedKey) -> None:
+    def __init__(
+        self,
+        disturb: Callable[[Tensor, Tensor], Tensor],
+        value: float | Sequence[float],
+        action_key: NestedKey,
+    ) -> None:
         super().__init__()
         tensor = torch.as_tensor(value, dtype=torch.float64)
         if tensor.ndim > 1 or not tensor.isfinite().all():
@@ -32,6 +32,7 @@ class _ActuatorDisturbance(Transform):
             )
         self.register_buffer("value", tensor)
         self.action_key = action_key
+        self._disturb = disturb
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get(self.action_key)
@@ -40,7 +41,7 @@ class _ActuatorDisturbance(Transform):
                 f"{type(self).__name__} has {self.value.shape[-1]} values, but the action "
                 f"{self.action_key!r} has {action.shape[-1]} entries."
             )
-        return tensordict.set(self.action_key, self.disturb(action, self.value.to(action)))
+        return tensordict.set(self.action_key, self._disturb(action, self.value.to(action)))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Refuses to work on stored data.
@@ -79,10 +80,8 @@ class ActuatorBias(_ActuatorDisturbance):
         torch.Size([2, 3, 6])
     """
 
-    disturb = staticmethod(torch.add)
-
     def __init__(self, bias: float | Sequence[float], action_key: NestedKey = "action") -> None:
-        super().__init__(bias, action_key)
+        super().__init__(torch.add, bias, action_key)
 
 
 class ActuatorGain(_ActuatorDisturbance):
@@ -98,7 +97,5 @@ class ActuatorGain(_ActuatorDisturbance):
         ValueError: if the gain is not finite or, at the first step, has the wrong length.
     """
 
-    disturb = staticmethod(torch.mul)
-
     def __init__(self, gain: float | Sequence[float], action_key: NestedKey = "action") -> None:
-        super().__init__(gain, action_key)
+        super().__init__(torch.mul, gain, action_key)
