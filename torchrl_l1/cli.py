@@ -98,8 +98,9 @@ def _evaluate_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
     evaluate = commands.add_parser(
         "evaluate",
         help="evaluate trained policies with L1 on and off under noise and disturbances",
-        description="Frozen policy and model, every combination of L1, noise, disturbance and "
-        "stochastic or deterministic policy. Several run directories are seeds of one study.",
+        description="Frozen policy and model, every combination of L1 and its tuning, noise, "
+        "disturbance and stochastic or deterministic policy. Several run directories are seeds of "
+        "one study.",
     )
     add = evaluate.add_argument
     add("run_dir", nargs="+", help="one or more run directories")
@@ -107,7 +108,20 @@ def _evaluate_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
     add("--noise", nargs="+", default=["none"], help="settings of the noise group")
     add("--bias", nargs="+", type=float, default=[0.0], help="actuator biases, action units")
     add("--gain", nargs="+", type=float, default=[1.0], help="actuator gains")
-    add("--epsilon", type=float, help="tolerance of the switching law; the run's own by default")
+    add(
+        "--epsilon",
+        nargs="+",
+        type=float,
+        default=[],
+        help="tolerances of the switching law; the run's own by default",
+    )
+    add(
+        "--alpha",
+        nargs="+",
+        type=float,
+        default=[],
+        help="gains of the filter per step; the controller's own by default",
+    )
     add(
         "--policy",
         nargs="+",

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import fcntl
+import json
 import os
 import random
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,6 +21,7 @@ from omegaconf import OmegaConf
 
 from torchrl_l1.campaign import child, jobs, progress
 from torchrl_l1.campaign.description import read_campaign
+from torchrl_l1.campaign.evaluation import evaluate_run, is_evaluated
 from torchrl_l1.campaign.launcher import sweep
 from torchrl_l1.campaign.plan import plan
 from torchrl_l1.campaign.progress import overview
@@ -146,14 +149,40 @@ def test_skips_finishes_evaluates_and_goes_on_past_a_failure(
     # A table is due again for other settings, and if its run has gone on since.
     edit(campaign_file, evaluations=[evaluation | {"bias": [0.5]}])
     assert "finished, 0 of 1 evaluations" in overview(planned(campaign_file, output)[1:])
+    # Tables that are older than lists of epsilon, and than alpha, count on.
+    described = path_of(fresh, "noisy").with_suffix(".yaml")
+    now = described.read_text()
+    older = {k: v for k, v in load_yaml(described).items() if k != "alpha"} | {"epsilon": None}
+    described.write_text(dump_yaml(older))
+    assert "finished, 1 of 1 evaluations" in overview([fresh])
+    described.write_text(dump_yaml(older | {"epsilon": 0.3}))
+    assert "finished, 0 of 1 evaluations" in overview([fresh])
+    for broken in ("[]", "iterations: 2\nloudness: 3", now.replace("iterations", "rounds")):
+        described.write_text(broken)
+        assert "finished, 0 of 1 evaluations" in overview([fresh])
+    described.write_text(now)
     # A copy keeps no times; what counts is the number of iterations.
     os.utime(fresh.directory.checkpoint_file)
     assert "finished, 1 of 1 evaluations" in overview([fresh])
-    described = path_of(fresh, "noisy").with_suffix(".yaml")
     assert load_yaml(described)["iterations"] == 2
     with fresh.directory.metrics_file.open("a") as file:
         file.write("another,row\n")
     assert "finished, 0 of 1 evaluations" in overview([fresh])
+
+
+def test_evaluation_sweeps_epsilon_and_alpha(campaign_file: Path) -> None:
+    sweep = {"name": "tuning", "epsilon": [0.5, 2], "alpha": 0.1, "policy": ["stochastic"]}
+    edit(campaign_file, matrix={"seed": [0]}, evaluations=[sweep | {"episodes": 1}])
+    (this,) = planned(campaign_file, campaign_file.parent / "out")
+    train(this)
+    (settings,) = this.evaluations
+    assert not is_evaluated(this.directory, settings)
+    # As they reach the process that evaluates.
+    evaluate_run(str(this.directory.path), "tuning", json.loads(json.dumps(settings.of_a_run())))
+    assert is_evaluated(this.directory, settings)
+    rows = [(row["l1"], row["epsilon"], row["alpha"]) for row in table(this, "tuning")]
+    assert rows == [("off", "", ""), ("paper", "0.5", "0.1"), ("paper", "2.0", "0.1")]
+    assert not is_evaluated(this.directory, replace(settings, alpha=[0.2]))
 
 
 def path_of(this: PlannedRun, name: str) -> Path:

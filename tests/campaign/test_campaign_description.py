@@ -76,6 +76,15 @@ def test_evaluations_go_to_the_runs_that_match(write: Any, tmp_path: Path) -> No
     }
 
 
+@pytest.mark.parametrize(
+    ("text", "values"), [("null", []), ("[]", []), ("3", [3.0]), ("[1e-1, 1]", [0.1, 1.0])]
+)
+def test_tuning_of_an_evaluation_is_a_list(text: str, values: list[float], write: Any) -> None:
+    file = write(RUNS + f"evaluations: [{{name: e, epsilon: {text}}}]\n")
+    (settings,) = read_campaign(file).evaluations
+    assert (settings.epsilon, settings.alpha) == (values, [])
+
+
 def test_a_users_recipe_is_found_beside_the_campaign(write: Any, tmp_path: Path) -> None:
     (tmp_path / "own.yaml").write_text(
         "defaults: [metrpo_recipe, {l1: slow}, {noise: action}, {preset: cpu}, _self_]\n"
@@ -146,6 +155,10 @@ def test_a_users_recipe_is_found_beside_the_campaign(write: Any, tmp_path: Path)
         (RUNS + "evaluations: [{name: e, bias: [high]}]", "bias holds 'high'"),
         (RUNS + "evaluations: [{name: e, gain: [.inf]}]", "gain must be finite"),
         (RUNS + "evaluations: [{name: e, epsilon: 0}]", "epsilon must be positive"),
+        (RUNS + "evaluations: [{name: e, epsilon: [1, -1]}]", "epsilon must be positive"),
+        (RUNS + "evaluations: [{name: e, epsilon: true}]", "epsilon must be null, a number or a"),
+        (RUNS + "evaluations: [{name: e, alpha: [slow]}]", "alpha must be null, a number or a"),
+        (RUNS + "evaluations: [{name: e, alpha: 1.5}]", "alpha must be above 0 and at most 1"),
         (RUNS + "evaluations: [{name: e, where: {l1: [slow]}}]", "no run has l1=slow; there are"),
         (RUNS + "evaluations: [{name: e, where: {l2: [off]}}]", "none with a l2"),
         (RUNS + "evaluations: [{name: e}, {name: e, where: {l1: [off]}}]", "another evaluation"),

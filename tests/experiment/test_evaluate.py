@@ -23,6 +23,44 @@ def test_conditions_vary_bias_and_gain_apart() -> None:
     assert len(cells) == 6
 
 
+def test_conditions_sweep_epsilon_and_alpha_but_not_without_l1() -> None:
+    sweep = ([0.1, 1.0, 0.1], [0.05, 0.35])
+    cells = conditions(
+        ["off", "paper", "slow"], ["none"], [0.0, 1.0], [1.0], ["stochastic"], *sweep
+    )
+    assert len(cells) == len(set(cells)) == 2 * (1 + 2 * 2 * 2)
+    off = [(cell.epsilon, cell.alpha) for cell in cells if cell.l1 == "off"]
+    assert off == [(None, None)] * 2
+    on = {(cell.epsilon, cell.alpha) for cell in cells if cell.l1 == "slow" and cell.bias == 1.0}
+    assert on == {(0.1, 0.05), (0.1, 0.35), (1.0, 0.05), (1.0, 0.35)}
+    only_alpha = conditions(["paper"], ["none"], [0.0], [1.0], ["stochastic"], alpha=[0.2])
+    assert [(cell.epsilon, cell.alpha) for cell in only_alpha] == [(None, 0.2)]
+
+
+def test_evaluate_sweeps_epsilon_and_alpha(
+    tiny_recipe: Recipe, capsys: pytest.CaptureFixture[str]
+) -> None:
+    directory = run(tiny_recipe("l1=off"))
+    sweep = ["--epsilon", "1e-9", "1e9", "--alpha", "0.05", "--policy", "stochastic"]
+    main(["evaluate", str(directory), "--bias", "0", "--episodes", "2", *sweep])
+    with (directory / "evaluation" / "evaluation.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["l1"] for row in rows] == ["off", "paper", "paper"]
+    assert (rows[0]["epsilon"], rows[0]["alpha"]) == ("", "")
+    assert [(float(row["epsilon"]), float(row["alpha"])) for row in rows[1:]] == [
+        (1e-9, 0.05),
+        (1e9, 0.05),
+    ]
+    # A tolerance of nearly nothing moves the operating point again and again, a huge one never.
+    often, never = (float(row["l1/switch_rate"]) for row in rows[1:])
+    assert often > 0.9 and never == 0
+    labels = ["off", "paper epsilon=1e-09 alpha=0.05", "paper epsilon=1e+09 alpha=0.05"]
+    with (directory / "evaluation" / "summary.csv").open() as file:
+        assert [row["l1"] for row in csv.DictReader(file)] == labels
+    heading = capsys.readouterr().out.split("bias")[1].splitlines()[0]
+    assert heading.split() == ["gain", *" ".join(labels).split()]
+
+
 def test_evaluate_writes_table_and_plot(
     tiny_recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -71,6 +109,10 @@ def test_summary_is_the_median_over_training_seeds() -> None:
         (["evaluate", "nowhere", "--l1", "of"], "unknown l1 setting 'of'; there are off, paper"),
         (["evaluate", "nowhere", "--noise", "loud"], "unknown noise setting"),
         (["evaluate", "nowhere", "--episodes", "0"], "--episodes must be positive"),
+        (["evaluate", "nowhere", "--epsilon", "1", "0"], "--epsilon must be positive and finite"),
+        (["evaluate", "nowhere", "--epsilon", "inf"], "--epsilon must be positive and finite"),
+        (["evaluate", "nowhere", "--alpha", "0.1", "1.5"], "--alpha must be above 0 and at most 1"),
+        (["evaluate", "nowhere", "--alpha", "nan"], "--alpha must be above 0 and at most 1"),
         (["verify", "nowhere.npz"], "no trace file"),
         (["run", "metrpo/inverted_pendlum"], "Did you mean metrpo/inverted_pendulum"),
     ],

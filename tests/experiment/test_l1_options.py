@@ -1,13 +1,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 from omegaconf import DictConfig
 
 from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.experiment.evaluate import Condition, evaluate, load_run, make_collection
-from torchrl_l1.experiment.l1_options import closest_option, departures, filter_gain, l1_options
+from torchrl_l1.experiment.l1_options import (
+    closest_option,
+    departures,
+    filter_gain,
+    l1_options,
+    same_controller,
+)
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.schema import L1Settings
 
@@ -54,9 +61,43 @@ def test_a_run_is_tested_with_the_controller_it_was_trained_with(tiny_recipe: Re
     trained = load_run(run(tiny_recipe("l1=paper", "l1.epsilon=0.5", *tuned)))
     cells = [Condition(l1, "none", 0.0, 1.0, "stochastic") for l1 in ("off", "paper", "slow")]
     assert [row["own_l1"] for row in evaluate(trained, cells, 2)] == [0, 1, 0]
-    assert [row["own_l1"] for row in evaluate(trained, cells, 2, epsilon=0.4)] == [0, 0, 0]
+    stricter = [replace(cell, epsilon=0.4) for cell in cells]
+    assert [row["own_l1"] for row in evaluate(trained, stricter, 2)] == [0, 0, 0]
     own, slow = (controller(trained, cell, 2) for cell in cells[1:])
     assert (own.filter_gain, own.a_s, own.on_switch, own.project) == (0.2, -2.0, "reset", False)
     assert (slow.filter_gain, slow.a_s, slow.on_switch, slow.project) == (0.1, -1.0, "keep", True)
     assert own.epsilon == slow.epsilon == 0.5
-    assert controller(trained, cells[1], 2, 0.4).epsilon == 0.4
+    assert controller(trained, stricter[1], 2).epsilon == 0.4
+
+
+def test_values_that_a_test_sets_take_the_place_of_the_runs_own(tiny_recipe: Recipe) -> None:
+    # 2.5 rad/s at 0.04 s make a gain of 0.1.
+    trained = load_run(run(tiny_recipe("l1=paper", "l1.epsilon=0.5", "l1.cutoff=2.5", "l1.a_s=-2")))
+    cell = Condition("slow", "none", 0.0, 1.0, "stochastic")
+    # The option that it is closest to is slow, whose gain it has.
+    tests = [
+        (cell, 1, 0.5, 0.1, -2.0),
+        (replace(cell, alpha=0.1), 1, 0.5, 0.1, -2.0),
+        (replace(cell, epsilon=0.5, alpha=0.1), 1, 0.5, 0.1, -2.0),
+        (replace(cell, alpha=0.3), 0, 0.5, 0.3, -2.0),
+        (replace(cell, epsilon=2.0), 0, 2.0, 0.1, -2.0),
+        (replace(cell, l1="paper", alpha=0.1), 0, 0.5, 0.1, -1.0),
+    ]
+    rows = list(evaluate(trained, [test[0] for test in tests], 1))
+    assert [row["own_l1"] for row in rows] == [test[1] for test in tests]
+    assert [(row["epsilon"], row["alpha"]) for row in rows[:3]] == [
+        (None, None), (None, 0.1), (0.5, 0.1)
+    ]  # fmt: skip
+    for test, _, epsilon, gain, a_s in tests:
+        config = controller(trained, test, 1)
+        assert (config.epsilon, config.filter_gain, config.a_s) == pytest.approx(
+            (epsilon, gain, a_s)
+        )
+
+
+def test_controllers_that_are_off_are_the_same() -> None:
+    off, on = L1Settings(epsilon=0.3), L1Settings(enabled=True)
+    assert same_controller(off, L1Settings(alpha=0.1), "swimmer")
+    assert not same_controller(off, on, "swimmer")
+    assert same_controller(on, replace(on, compile="auto", alpha=0.35), "swimmer")
+    assert not same_controller(on, replace(on, alpha=0.34), "swimmer")

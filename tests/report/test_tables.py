@@ -257,6 +257,40 @@ def test_both_means_the_controller_of_the_training(
     assert both == ["paper"] * (overrides != ("l1=off",) and "paper" in expected)
 
 
+def test_set_values_make_controllers_of_their_own(write_run: WriteRun, tmp_path: Path) -> None:
+    conditions = [("off", "none", "stochastic", 0.0), ("paper", "none", "stochastic", 0.0)]
+    for seed in range(2):
+        off, plain = (row | {"own_l1": 0} for row in evaluated(-1.0 - seed, *conditions))
+        tests = [off, plain | {"own_l1": 1, "return_mean": -9.0, "l1/switch_rate": 0.25}]
+        for epsilon, rate in ((10.0, 0.0), (3.0, 0.1 + seed)):
+            swept = {"epsilon": epsilon, "alpha": 0.1, "l1/switch_rate": rate}
+            tests.append(plain | swept | {"return_mean": -seed, "own_l1": int(epsilon == 3)})
+        tests.append(plain | {"epsilon": 1.0, "alpha": ""})
+        columns = {**tests[2], **dict.fromkeys(tests[2], "")}
+        tests = [columns | test for test in tests]
+        write_run([1.0], "l1=paper", seed=seed, evaluations={"ablation": tests})
+    rows = evaluation_rows(study(tmp_path), "ablation")
+    # By the values; set values are named where they are those of the training, too.
+    assert [row["l1"] for row in rows] == [
+        "off",
+        "paper",
+        "paper epsilon=1",
+        "paper epsilon=3 alpha=0.1",
+        "paper epsilon=10 alpha=0.1",
+    ]
+    off, own, only_epsilon, three, ten = rows
+    assert "option" not in off and "option" not in own
+    assert (three["option"], three["epsilon"], three["alpha"]) == ("paper", 3.0, 0.1)
+    assert only_epsilon["alpha"] is None
+    assert (three["training_seeds"], three["differences"]) == (2, "1 1")
+    rates = [row.get("switches_per_1000_steps") for row in (off, own, three, ten)]
+    assert rates == [None, pytest.approx(250), pytest.approx(600), 0]
+    assert "switches_per_1000_steps" not in only_epsilon
+    assert "paper_mean" in off and "paper_mean" in own and "paper_mean" not in three
+    assert "| L1 paper epsilon=3 alpha=0.1 less off |" in evaluation_table(rows)
+    assert [row["phase"] for row in ablation_rows(rows)] == ["training only", "both"]
+
+
 def test_control_affine_runs_have_no_published_cell(write_run: WriteRun, tmp_path: Path) -> None:
     tests = evaluated(-1.0, ("off", "action", "stochastic", 0.0))
     write_run([1.0], "l1=off", "model=affine", evaluations={"sim_to_real": tests})

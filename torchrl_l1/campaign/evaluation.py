@@ -18,13 +18,20 @@ def evaluation_file(run_dir: Path, name: str) -> Path:
 
 
 def is_evaluated(directory: RunDirectory, settings: EvaluationSettings) -> bool:
-    """Whether the table is there, made with these settings after the last iteration."""
+    """Whether the table is there, made with these settings after the last iteration.
+
+    Settings that its description does not mention, since it is older than they are, have their
+    defaults.
+    """
     table = evaluation_file(directory.path, settings.name)
     try:
-        before: object = load_yaml(table.with_suffix(".yaml"))
-    except (OSError, ValueError):
+        before = load_yaml(table.with_suffix(".yaml"))
+        iterations = before.pop("iterations")
+        made_with = EvaluationSettings(name=settings.name, **before)
+    except (OSError, ValueError, AttributeError, KeyError, TypeError):
         return False
-    return table.exists() and before == _described(settings, directory.iterations_done())
+    now = _described(settings, directory.iterations_done())
+    return table.exists() and _described(made_with, iterations) == now
 
 
 def _described(settings: EvaluationSettings, iterations: int) -> dict[str, Any]:
@@ -47,9 +54,17 @@ def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
         RunDirectoryError: if the directory holds no run or no checkpoint.
     """
     chosen = EvaluationSettings(name=name, **settings)
-    cells = conditions(chosen.l1, chosen.noise, chosen.bias, chosen.gain, chosen.policy)
+    cells = conditions(
+        chosen.l1,
+        chosen.noise,
+        chosen.bias,
+        chosen.gain,
+        chosen.policy,
+        chosen.epsilon,
+        chosen.alpha,
+    )
     trained = load_run(run_dir)
-    rows = list(evaluate(trained, cells, chosen.episodes, chosen.seed, chosen.epsilon))
+    rows = list(evaluate(trained, cells, chosen.episodes, chosen.seed))
     table = evaluation_file(Path(run_dir), name)
     described = table.with_suffix(".yaml")
     table.parent.mkdir(exist_ok=True)

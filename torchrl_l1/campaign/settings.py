@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from torchrl_l1.experiment.l1_options import check_tuning
+
 # What may become part of a path and of a Hydra override without quotes.
 _PLAIN = re.compile(r"[A-Za-z0-9_.+-]+")
 _RESERVED = ("run_dir", "resume")
@@ -78,7 +80,9 @@ class EvaluationSettings:
         policy: ``stochastic`` and ``deterministic``.
         episodes: episodes per cell.
         seed: seed of resets, noise and sampled actions.
-        epsilon: tolerance of the switching law, raw state units; the run's own if null.
+        epsilon: tolerances of the switching law, raw state units, as a number or a list; the
+            run's own if null.
+        alpha: gains of the filter per step, as a number or a list; the controller's own if null.
     """
 
     name: str
@@ -90,7 +94,8 @@ class EvaluationSettings:
     policy: list[str] = field(default_factory=lambda: list(_POLICIES))
     episodes: int = 25
     seed: int = 0
-    epsilon: float | None = None
+    epsilon: list[float] = field(default_factory=list)
+    alpha: list[float] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         """Check types and ranges.
@@ -118,10 +123,12 @@ class EvaluationSettings:
             value = getattr(self, key)
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
                 raise CampaignError(f"{key} must be a whole number from {least}, got {value!r}")
-        if self.epsilon is not None:
-            if not isinstance(self.epsilon, (int, float)) or not self.epsilon > 0:
-                raise CampaignError(f"epsilon must be positive or null, got {self.epsilon!r}")
-            self.epsilon = float(self.epsilon)
+        self.epsilon = _numbers("epsilon", self.epsilon)
+        self.alpha = _numbers("alpha", self.alpha)
+        try:
+            check_tuning(self.epsilon, self.alpha)
+        except ValueError as error:
+            raise CampaignError(str(error)) from error
 
     def of_a_run(self) -> dict[str, Any]:
         """What the table of a single run depends on: all settings but ``name`` and ``where``."""
@@ -179,6 +186,14 @@ def override_key(override: str) -> str:
     if not equals or not key.strip("+~"):
         raise CampaignError(f"{override!r} is not an override; write KEY=VALUE")
     return key.strip("+~").partition("@")[0]
+
+
+def _numbers(key: str, value: Any) -> list[float]:
+    """Null, a number or a list of numbers as a list."""
+    values = [] if value is None else value if isinstance(value, list) else [value]
+    if any(isinstance(one, bool) or not isinstance(one, (int, float)) for one in values):
+        raise CampaignError(f"{key} must be null, a number or a list of numbers, got {value!r}")
+    return [float(one) for one in values]
 
 
 def _check_list(

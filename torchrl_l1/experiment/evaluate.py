@@ -18,7 +18,12 @@ from torchrl_l1.algorithms.collection import (
     signal_metrics,
 )
 from torchrl_l1.algorithms.metrpo import METRPO
-from torchrl_l1.experiment.l1_options import closest_option, l1_option
+from torchrl_l1.experiment.l1_options import (
+    closest_option,
+    controller_label,
+    l1_option,
+    same_controller,
+)
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run import build
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
@@ -27,13 +32,31 @@ from torchrl_l1.experiment.schema import L1Settings, METRPORecipe, l1_config
 
 @dataclass(frozen=True)
 class Condition:
-    """One cell: which controller, which noise, which disturbance, which kind of policy."""
+    """One cell: which controller, which noise, which disturbance, which kind of policy.
+
+    Attributes:
+        l1: option of the ``l1`` group.
+        noise: option of the ``noise`` group.
+        bias: actuator bias, action units.
+        gain: actuator gain.
+        policy: ``stochastic`` or ``deterministic``.
+        epsilon: tolerance of the switching law, raw state units; the run's own if ``None``.
+        alpha: gain of the filter per step; that of the option (or of the run's own controller)
+            if ``None``.
+    """
 
     l1: str
     noise: str
     bias: float
     gain: float
     policy: str
+    epsilon: float | None = None
+    alpha: float | None = None
+
+    @property
+    def controller(self) -> str:
+        """The controller in tables and figures, see :func:`controller_label`."""
+        return controller_label(self.l1, self.epsilon, self.alpha)
 
 
 @dataclass
@@ -71,11 +94,29 @@ def conditions(
     bias: Sequence[float],
     gain: Sequence[float],
     policy: Sequence[str],
+    epsilon: Sequence[float] = (),
+    alpha: Sequence[float] = (),
 ) -> list[Condition]:
-    """Every combination of controller, noise and policy with each bias and, apart, each gain."""
+    """Every combination of controller, noise and policy with each bias and, apart, each gain.
+
+    Every controller but ``off`` is tested with each ``epsilon`` and each ``alpha``; without
+    values, as it is.
+
+    Examples:
+        >>> cells = conditions(["off", "paper"], ["none"], [0.0], [1.0], ["stochastic"], [0.3, 1.0])
+        >>> [cell.controller for cell in cells]
+        ['off', 'paper epsilon=0.3', 'paper epsilon=1']
+    """
     disturbances = [(b, 1.0) for b in bias] + [(0.0, g) for g in gain if g != 1.0]
+    tunings = list(product(epsilon or (None,), alpha or (None,)))
     cells = product(policy, noise, disturbances, l1)
-    return list(dict.fromkeys(Condition(on, n, b, g, p) for p, n, (b, g), on in cells))
+    return list(
+        dict.fromkeys(
+            Condition(on, n, b, g, p, *tuning)
+            for p, n, (b, g), on in cells
+            for tuning in (tunings if on != "off" else [(None, None)])
+        )
+    )
 
 
 def evaluate(
@@ -83,32 +124,31 @@ def evaluate(
     cells: Sequence[Condition],
     episodes: int,
     seed: int = 0,
-    epsilon: float | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Returns of a frozen policy, one row per condition.
 
     Every condition sees the same resets and the same random numbers. Model and policy are
     those of the run's last checkpoint. ``own_l1`` is 1 where the controller is the one that the
-    run was trained with, else 0.
+    run was trained with, else 0; ``epsilon`` and ``alpha`` hold what the condition sets.
     """
     for cell in cells:
-        collection = make_collection(trained, cell, episodes, epsilon)
+        collection = make_collection(trained, cell, episodes)
         data = collection.evaluate(seed, deterministic=cell.policy == "deterministic")
         yield {
             "run": str(trained.path),
             "training_seed": trained.recipe.seed,
             **vars(cell),
-            "own_l1": int(_tested_l1(trained, cell.l1, epsilon) == trained.recipe.l1),
+            "own_l1": int(
+                same_controller(_tested_l1(trained, cell), trained.recipe.l1, trained.recipe.task)
+            ),
             **return_metrics(data),
             **signal_metrics(first_episodes(data)),
         }
 
 
-def make_collection(
-    trained: TrainedRun, cell: Condition, episodes: int, epsilon: float | None = None
-) -> Collection:
+def make_collection(trained: TrainedRun, cell: Condition, episodes: int) -> Collection:
     """The environments of one condition around the frozen policy and model."""
-    settings = _tested_l1(trained, cell.l1, epsilon)
+    settings = _tested_l1(trained, cell)
     perturbation = Perturbation(
         **group_setting("noise", cell.noise), actuator_bias=cell.bias, actuator_gain=cell.gain
     )
@@ -123,14 +163,20 @@ def make_collection(
     )
 
 
-def _tested_l1(trained: TrainedRun, option: str, epsilon: float | None) -> L1Settings:
+def _tested_l1(trained: TrainedRun, cell: Condition) -> L1Settings:
     """The controller of a test.
 
     Where the option is the one that the run was trained with, however it was tuned, it is the
-    run's own. Any other is as shipped, with the run's epsilon.
+    run's own. Any other is as shipped, with the run's epsilon. What the condition sets counts
+    for either.
     """
     own = trained.recipe.l1
-    epsilon = own.epsilon if epsilon is None else epsilon
-    if option == closest_option(own, trained.recipe.task):
-        return replace(own, epsilon=epsilon)
-    return replace(l1_option(option), epsilon=epsilon)
+    if cell.l1 == closest_option(own, trained.recipe.task):
+        settings = own
+    else:
+        settings = replace(l1_option(cell.l1), epsilon=own.epsilon)
+    if cell.epsilon is not None:
+        settings = replace(settings, epsilon=cell.epsilon)
+    if cell.alpha is not None:
+        settings = replace(settings, alpha=cell.alpha, cutoff=None)
+    return settings

@@ -16,6 +16,7 @@ from torchrl_l1.experiment.evaluate import (
     load_run,
 )
 from torchrl_l1.experiment.filmstrip import write_filmstrip
+from torchrl_l1.experiment.l1_options import check_tuning
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.robustness import plot_robustness, summarize, table
 from torchrl_l1.experiment.run_directory import write_table
@@ -38,7 +39,11 @@ def _check_one_study(runs: Sequence[TrainedRun]) -> None:
 
 def evaluate_command(options: argparse.Namespace) -> None:
     """``torchrl-l1 evaluate``: table on the screen, CSV, PNG and, if asked, a filmstrip."""
-    cells = conditions(options.l1, options.noise, options.bias, options.gain, options.policy)
+    tuning = (options.epsilon, options.alpha)
+    check_tuning(*tuning, prefix="--")
+    cells = conditions(
+        options.l1, options.noise, options.bias, options.gain, options.policy, *tuning
+    )
     for name in options.l1:
         group_setting("l1", name)
     for name in options.noise:
@@ -52,7 +57,7 @@ def evaluate_command(options: argparse.Namespace) -> None:
     total = len(runs) * len(cells)
     with tqdm(total=total, desc="evaluate", unit="cell", disable=None) as progress:
         for trained in runs:
-            for row in evaluate(trained, cells, options.episodes, options.seed, options.epsilon):
+            for row in evaluate(trained, cells, options.episodes, options.seed):
                 rows.append(row)
                 progress.update()
 
@@ -66,4 +71,5 @@ def evaluate_command(options: argparse.Namespace) -> None:
     print(f"Plot: {output / 'robustness.png'}")
     if options.filmstrip:
         worst = max(options.bias, key=abs)
-        write_filmstrip(runs[0], options.l1, worst, options.seed, output, options.epsilon)
+        shown = conditions(options.l1, ["none"], [worst], [1.0], ["deterministic"], *tuning)
+        write_filmstrip(runs[0], shown, options.seed, output)

@@ -22,42 +22,40 @@ _COLUMNS = 10
 
 def write_filmstrip(
     trained: TrainedRun,
-    controllers: Sequence[str],
-    bias: float,
+    cells: Sequence[Condition],
     seed: int,
     output: Path,
-    epsilon: float | None = None,
 ) -> None:
-    """Render one deterministic episode per controller into ``filmstrip.png`` and ``.gif``.
+    """Render one deterministic episode per condition into ``filmstrip.png`` and ``.gif``.
 
-    Where no headless OpenGL works, a line says so and nothing is written.
+    The conditions share their disturbance; rows are named by their controllers. Where no
+    headless OpenGL works, a line says so and nothing is written.
     """
     task = trained.algorithm.task
     steps = min(trained.recipe.horizon or task.horizon, round(_SECONDS_SHOWN / task.dt))
     try:
         rows = {
-            f"L1 {name}": rollout_frames(
-                task, _poses(trained, Condition(name, "none", bias, 1.0, ""), steps, seed, epsilon)
+            # A line for each value that is set: a row is not wide.
+            "L1 " + cell.controller.replace(" ", "\n"): rollout_frames(
+                task, _poses(trained, cell, steps, seed)
             )
-            for name in controllers
+            for cell in cells
         }
     except RenderingUnavailable as error:
         print(f"No filmstrip: {error}")
         return
     strip = filmstrip(rows, output / "filmstrip.png", every=max(1, steps // _COLUMNS), dt=task.dt)
     moving = animation(rows, output / "rollout.gif", dt=task.dt)
-    print(f"Filmstrip at bias {bias:g}: {strip}, animation: {moving}")
+    print(f"Filmstrip at bias {cells[0].bias:g}: {strip}, animation: {moving}")
 
 
-def _poses(
-    trained: TrainedRun, cell: Condition, steps: int, seed: int, epsilon: float | None
-) -> np.ndarray:
+def _poses(trained: TrainedRun, cell: Condition, steps: int, seed: int) -> np.ndarray:
     """Simulator positions ``(T, nq)`` of the first environment."""
     poses: list[np.ndarray] = []
 
     def record(env: EnvBase, _: object) -> None:
         poses.append(env.base_env.simulator_state()[0][0])
 
-    collection = make_collection(trained, cell, 1, epsilon)
+    collection = make_collection(trained, cell, 1)
     collection.evaluate(seed, deterministic=True, steps=steps, callback=record)
     return np.stack(poses)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from functools import cache
 from typing import Any
@@ -9,7 +11,16 @@ from typing import Any
 from torchrl_l1.experiment.recipes import group_options, group_setting
 from torchrl_l1.experiment.schema import L1Settings, l1_config
 
-__all__ = ["closest_option", "departures", "filter_gain", "l1_option", "l1_options"]
+__all__ = [
+    "check_tuning",
+    "closest_option",
+    "controller_label",
+    "departures",
+    "filter_gain",
+    "l1_option",
+    "l1_options",
+    "same_controller",
+]
 
 # What runs are tuned by; it makes no other controller.
 _TUNED = ("enabled", "epsilon", "compile")
@@ -100,3 +111,54 @@ def closest_option(settings: L1Settings, task: str, *, by_filter: bool = True) -
         return len(found), by_filter and filters, option != "paper"
 
     return min((name for name, values in l1_options().items() if values.enabled), key=distance)
+
+
+def same_controller(one: L1Settings, other: L1Settings, task: str) -> bool:
+    """Whether two settings make the same controller, compiled or not.
+
+    Filters are compared by their gain; controllers that are off are the same.
+
+    Examples:
+        >>> own = L1Settings(enabled=True, epsilon=0.3, cutoff=2.5)
+        >>> same_controller(own, replace(own, alpha=0.1, cutoff=None), "inverted_pendulum")
+        True
+        >>> same_controller(own, replace(own, epsilon=1.0), "inverted_pendulum")
+        False
+    """
+    if not (one.enabled and other.enabled):
+        return one.enabled == other.enabled
+    first, second = (
+        replace(settings, alpha=filter_gain(settings, task), cutoff=None, compile=False)
+        for settings in (one, other)
+    )
+    return first == second
+
+
+def controller_label(option: str, epsilon: float | None = None, alpha: float | None = None) -> str:
+    """An option and what a test has set of it, as tables and figures name a controller.
+
+    Examples:
+        >>> controller_label("paper", 0.3, 0.1), controller_label("off")
+        ('paper epsilon=0.3 alpha=0.1', 'off')
+    """
+    values = {"epsilon": epsilon, "alpha": alpha}
+    return " ".join([option, *(f"{k}={v:.9g}" for k, v in values.items() if v is not None)])
+
+
+def check_tuning(epsilon: Sequence[float], alpha: Sequence[float], prefix: str = "") -> None:
+    """Refuse values that no controller can be tested with.
+
+    Args:
+        epsilon: tolerances of the switching law.
+        alpha: gains of the filter per step.
+        prefix: what stands before the name of an option where the user writes it.
+
+    Raises:
+        ValueError: naming the option and the value.
+    """
+    for value in epsilon:
+        if not (value > 0 and math.isfinite(value)):
+            raise ValueError(f"{prefix}epsilon must be positive and finite, got {value:g}")
+    for value in alpha:
+        if not 0 < value <= 1:
+            raise ValueError(f"{prefix}alpha must be above 0 and at most 1, got {value:g}")

@@ -13,14 +13,21 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
+from torchrl_l1.experiment.l1_options import controller_label
+
 _CELL = ("policy", "noise", "bias", "gain", "l1")
 
 
 def summarize(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Median, lowest and highest mean return over the training seeds, per condition."""
+    """Median, lowest and highest mean return over the training seeds, per condition.
+
+    A controller is named by its option and the values that the test has set.
+    """
     groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for row in rows:
-        groups.setdefault(tuple(row[key] for key in _CELL), []).append(row)
+        name = controller_label(row["l1"], row.get("epsilon"), row.get("alpha"))
+        named = {**row, "l1": name}
+        groups.setdefault(tuple(named[key] for key in _CELL), []).append(row)
     summary = []
     for cell, members in groups.items():
         returns = [float(row["return_mean"]) for row in members]
@@ -42,7 +49,7 @@ def summarize(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def table(summary: Sequence[Mapping[str, Any]]) -> str:
     """The summary as text: one line per disturbance, one column per controller."""
     controllers = list(dict.fromkeys(row["l1"] for row in summary))
-    width = 34
+    width = max(34, 2 + max(map(len, controllers), default=0))
     lines = []
     keys = dict.fromkeys((r["policy"], r["noise"], r["bias"], r["gain"]) for r in summary)
     heading = None

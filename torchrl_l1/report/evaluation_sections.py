@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from torchrl_l1.report.evaluation_figures import plot_ablation, plot_disturbances
@@ -11,6 +11,7 @@ from torchrl_l1.report.page import Page, slug
 from torchrl_l1.report.rendering import ablation_table, evaluation_table
 from torchrl_l1.report.settings import BASELINE
 from torchrl_l1.report.style import arm_label, noise_words, title
+from torchrl_l1.report.tuning_figures import plot_tuning, tuning_rows
 from torchrl_l1.report.variants import Study
 
 __all__ = ["evaluation_sections"]
@@ -36,6 +37,7 @@ def evaluation_sections(page: Page, study: Study) -> None:
             rows = ablation_rows(rows)
         if rows:
             special.get(name, _other(name))(page, rows)
+            _tuning(page, name, rows)
             page.csv(name, rows)
 
 
@@ -75,14 +77,37 @@ def _disturbances(page: Page, rows: Sequence[Row]) -> None:
         "Return of frozen policies against an actuator bias and an actuator gain that the model "
         "has never seen: mean over training seeds, with its 95 % interval as a band.",
     )
+    for heading, words, chosen in _training_cells(rows):
+        file = page.folder / f"disturbances_{slug(words)}.png"
+        page.figure(plot_disturbances(chosen, heading, file), heading)
+
+
+def _tuning(page: Page, name: str, rows: Sequence[Row]) -> None:
+    """A figure per training cell, where the tests go through values of the controller."""
+    explained = False
+    for heading, words, chosen in _training_cells(rows):
+        policy, swept = tuning_rows(chosen)
+        caption = f"{heading}; tested with {'the ' * (policy == 'deterministic')}{_ACTIONS[policy]}"
+        file = page.folder / f"sweep_{slug((name, *words))}.png"
+        drawn = plot_tuning(swept, caption, file)
+        if drawn is not None and not explained:
+            page.text(
+                "Switches and returns against the values of the controller that the tests set: "
+                "means over training seeds, lines 95 % intervals of the returns; dashed, the "
+                "same policies without L1."
+            )
+            explained = True
+        page.figure(drawn, caption)
+
+
+def _training_cells(rows: Sequence[Row]) -> Iterator[tuple[str, tuple[str, ...], list[Row]]]:
+    """The rows of each cell of the training, with a heading and its words."""
     cells = ("task", "training_noise", "training_l1", "variant")
     for cell in dict.fromkeys(tuple(row[key] for key in cells) for row in rows):
-        chosen = [row for row in rows if tuple(row[key] for key in cells) == cell]
         task, noise, l1, variant = cell
         heading = f"{title(task)}: trained with {noise_words(noise)} and {arm_label(l1)}"
         heading += f" ({variant})" * bool(variant)
-        file = page.folder / f"disturbances_{slug(cell)}.png"
-        page.figure(plot_disturbances(chosen, heading, file), heading)
+        yield heading, cell, [row for row in rows if tuple(row[key] for key in cells) == cell]
 
 
 def _other(name: str) -> Callable[[Page, Sequence[Row]], None]:

@@ -36,7 +36,8 @@ def evaluation_rows(study: Study, name: str) -> list[dict[str, Any]]:
     population standard deviation (as in the paper's tables), and the differences are those to
     the same policies tested without L1. Runs that are not finished are left out. Where ``l1``
     is equal to ``training_l1`` the policy was tested with the controller of its training;
-    another controller of that name is marked.
+    another controller of that name is marked. Where the test has set values of the controller,
+    ``l1`` names them, and ``option``, ``epsilon`` and ``alpha`` hold them.
     """
     rows = []
     for cell, runs in study.cells.items():
@@ -46,7 +47,7 @@ def evaluation_rows(study: Study, name: str) -> list[dict[str, Any]]:
             for test in run.evaluations[name]:
                 key = (_tested(run, test), *test.condition[1:])
                 tests.setdefault(key, []).append((run, test))
-        for key in sorted(tests, key=_order):
+        for key in sorted(tests, key=lambda key: _order(key, tests[key][0][1])):
             rows.append(
                 {
                     "task": cell.task,
@@ -54,6 +55,7 @@ def evaluation_rows(study: Study, name: str) -> list[dict[str, Any]]:
                     "training_l1": cell.arm,
                     "variant": variant_text(cell.variant),
                     **dict(zip(_CONDITION, key, strict=True)),
+                    **_tuning(tests[key][0][1]),
                     **_summary(tests[key]),
                     **_against_baseline(key, tests),
                     **_published(runs[0], key),
@@ -88,13 +90,18 @@ def phase(trained: str, tested: str) -> str:
 def _tested(run: Run, test: Evaluation) -> str:
     """The controller of a test: the training's L1 setting if it is that of the training."""
     what = run.identity
-    if BASELINE in (what.arm, test.l1):
-        return test.l1
+    if test.tuned or BASELINE in (what.arm, test.l1):
+        return test.controller
     # Older tables were made with the options as shipped.
     own = test.l1 == what.shipped if test.own_l1 is None else test.own_l1
     if own:
         return what.arm
     return f"{test.l1} (not as trained)" if test.l1 == what.arm else test.l1
+
+
+def _tuning(test: Evaluation) -> dict[str, Any]:
+    values = {"option": test.l1, "epsilon": test.epsilon, "alpha": test.alpha}
+    return values if test.tuned else {}
 
 
 def _summary(tests: Sequence[tuple[Run, Evaluation]]) -> dict[str, Any]:
@@ -109,6 +116,9 @@ def _summary(tests: Sequence[tuple[Run, Evaluation]]) -> dict[str, Any]:
     interval = mean_interval(values)
     if interval is not None:
         result |= {"return_low": interval.low, "return_high": interval.high}
+    switches = 1000 * float(np.mean([test.switch_rate for _, test in tests]))
+    if np.isfinite(switches):
+        result["switches_per_1000_steps"] = switches
     return result
 
 
@@ -135,6 +145,8 @@ def _published(run: Run, key: Key) -> dict[str, str]:
     return {} if cell is None else cell.columns()
 
 
-def _order(key: Key) -> Key:
+def _order(key: Key, test: Evaluation) -> Key:
     l1, noise, bias, gain, policy = key
-    return policy != "stochastic", noise_order(noise), bias, gain, l1 != BASELINE, l1
+    # By the values, where their texts would put 10 before 3.
+    controller = (test.l1, test.epsilon or 0.0, test.alpha or 0.0) if test.tuned else (l1, 0.0, 0.0)
+    return policy != "stochastic", noise_order(noise), bias, gain, l1 != BASELINE, controller

@@ -13,6 +13,7 @@ import numpy as np
 import yaml  # type: ignore[import-untyped]
 from omegaconf import OmegaConf
 
+from torchrl_l1.experiment.l1_options import controller_label
 from torchrl_l1.experiment.run_directory import RunDirectoryError
 from torchrl_l1.report.numeric_csv import numeric_rows
 
@@ -26,7 +27,9 @@ __all__ = [
     "read_versions",
 ]
 
-SIGNALS = ("l1/switch_rate", "l1/u_a", "l1/saturation")
+_SWITCH_RATE = "l1/switch_rate"
+
+SIGNALS = (_SWITCH_RATE, "l1/u_a", "l1/saturation")
 """Columns of a metrics table that only runs with L1 have."""
 
 _METRICS = ("iteration", "real_steps", "return_mean", "return_deterministic")
@@ -38,8 +41,19 @@ _TRAINING_PHASES = ("random", "fit", "trpo", "collect")
 class Evaluation:
     """Returns of a run's frozen policy under one condition, see ``torchrl-l1 evaluate``.
 
-    ``own_l1`` tells whether the controller was the one of the training; ``None`` in tables that
-    are older than this column.
+    Attributes:
+        l1: option of the ``l1`` group.
+        noise: option of the ``noise`` group.
+        bias: actuator bias, action units.
+        gain: actuator gain.
+        policy: ``stochastic`` or ``deterministic``.
+        return_mean: mean return over the episodes.
+        episodes: their number.
+        own_l1: whether the controller was the one of the training; ``None`` in tables that are
+            older than this column.
+        epsilon: tolerance of the switching law that the test has set; ``None`` if it has not.
+        alpha: gain of the filter that the test has set; ``None`` if it has not.
+        switch_rate: switches per step; NaN if unknown or without L1.
     """
 
     l1: str
@@ -50,11 +64,24 @@ class Evaluation:
     return_mean: float
     episodes: int
     own_l1: bool | None = None
+    epsilon: float | None = None
+    alpha: float | None = None
+    switch_rate: float = math.nan
 
     @property
     def condition(self) -> tuple[Any, ...]:
         """What was tested: equal for repetitions."""
-        return self.l1, self.noise, self.bias, self.gain, self.policy
+        return self.controller, self.noise, self.bias, self.gain, self.policy
+
+    @property
+    def controller(self) -> str:
+        """The option with the values that the test has set."""
+        return controller_label(self.l1, self.epsilon, self.alpha)
+
+    @property
+    def tuned(self) -> bool:
+        """Whether the test has set any."""
+        return self.epsilon is not None or self.alpha is not None
 
 
 def read_config(file: Path) -> dict[str, Any]:
@@ -87,14 +114,20 @@ def read_training_seconds(file: Path, iterations: int) -> np.ndarray:
 
 def read_evaluations(file: Path) -> list[Evaluation]:
     """The rows of an evaluation."""
+    optional = ("own_l1", "epsilon", "alpha", _SWITCH_RATE)
     return [
         Evaluation(
             row["l1"], row["noise"], row["bias"], row["gain"], row["policy"],
             row["return_mean"], int(row["episodes"]),
             None if math.isnan(row["own_l1"]) else bool(row["own_l1"]),
+            _known(row["epsilon"]), _known(row["alpha"]), row[_SWITCH_RATE],
         )
-        for row in _rows(file, _NUMBERS, ("l1", "noise", "policy"), optional=("own_l1",))
+        for row in _rows(file, _NUMBERS, ("l1", "noise", "policy"), optional)
     ]  # fmt: skip
+
+
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else value
 
 
 def _rows(
