@@ -91,6 +91,14 @@ def _campaign_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
     add("--output", help="folder of all runs; runs/campaigns/NAME by default")
     add("--workers", type=int, help="runs at a time; as many as there are cores by default")
     add("--list", action="store_true", help="show the runs and how far they are, start nothing")
+    add(
+        "--reuse",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="DIR",
+        help="copy finished runs with the same settings from these folders or below them",
+    )
     add("--launcher", help="hand the runs to one of Hydra's launchers, such as joblib")
 
 

@@ -12,8 +12,9 @@ from pathlib import Path
 from torchrl_l1.campaign.description import read_campaign
 from torchrl_l1.campaign.jobs import launch_runs, work_on_runs
 from torchrl_l1.campaign.launcher import check_launcher, elsewhere
-from torchrl_l1.campaign.plan import plan
+from torchrl_l1.campaign.plan import check_devices, plan
 from torchrl_l1.campaign.progress import overview
+from torchrl_l1.campaign.reuse import copy_run, find_reusable
 from torchrl_l1.campaign.settings import Campaign, CampaignError, override_key
 from torchrl_l1.campaign.workers import Stopped, available_cores
 from torchrl_l1.campaign.yaml_file import dump_yaml, load_yaml
@@ -37,14 +38,22 @@ def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> N
     campaign = read_campaign(options.campaign, [o for o in overrides if o not in for_hydra])
     output = Path(options.output or f"runs/campaigns/{campaign.name}").resolve()
     _check_owner(output, campaign)
-    runs = plan(campaign, output, elsewhere=bool(options.launcher) and elsewhere(options.launcher))
+    # Runs that are reused need no device, so devices are checked once these are known.
+    runs = plan(campaign, output, elsewhere=True)
+    reused = find_reusable(runs, output, [Path(folder) for folder in options.reuse])
+    if not (options.launcher and elsewhere(options.launcher)):
+        check_devices(campaign, [run for run in runs if run.directory.path not in reused])
     if options.list:
-        print(overview(runs))
+        print(overview(runs, reused))
         return
     output.mkdir(parents=True, exist_ok=True)
     failures = []
     with _hold(output):
         write_atomically(output / "campaign.yaml", dump_yaml(campaign.to_dict()))
+        for run in runs:
+            if source := reused.get(run.directory.path):
+                copy_run(source, run)
+                print(f"reused {run} from {source}", flush=True)
         try:
             if options.launcher:
                 failures = launch_runs(

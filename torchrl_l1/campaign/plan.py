@@ -59,7 +59,7 @@ def plan(campaign: Campaign, output: Path, elsewhere: bool = False) -> list[Plan
     for run in runs:
         run.check_directory()
     if not elsewhere:
-        _check_devices(campaign, runs)
+        check_devices(campaign, runs)
     return sorted(runs, key=lambda run: run.round)
 
 
@@ -100,7 +100,12 @@ def _check(config: DictConfig) -> None:
     check_mode(recipe.wandb.mode)
 
 
-def _check_devices(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
+def check_devices(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
+    """Make sure that this machine can train the runs that are not finished.
+
+    Raises:
+        CampaignError: if a device is not there.
+    """
     for run in runs:
         if run.finished():
             continue  # evaluations need no other device than the CPU

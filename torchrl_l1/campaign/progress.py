@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from tqdm import tqdm
 
@@ -27,19 +28,33 @@ def state(run: PlannedRun) -> str:
     return f"finished, {evaluated} of {len(run.evaluations)} evaluations"
 
 
-def overview(runs: Sequence[PlannedRun]) -> str:
-    """All runs with their states, a line for each, and a sum."""
-    states = [state(run) for run in runs]
+def overview(runs: Sequence[PlannedRun], reused: Mapping[Path, Path] | None = None) -> str:
+    """All runs with their states, a line for each, and a sum.
+
+    Args:
+        runs: the campaign's.
+        reused: where the finished run is that would be copied, by run directory.
+    """
+    sources = [(reused or {}).get(run.directory.path) for run in runs]
+    states = ["reused" if source else state(run) for run, source in zip(runs, sources, strict=True)]
     width = max(map(len, states))
-    lines = [f"{text:<{width}}  {run}" for text, run in zip(states, runs, strict=True)]
+    lines = [
+        f"{text:<{width}}  {run}" + (f" from {source}" if source else "")
+        for text, run, source in zip(states, runs, sources, strict=True)
+    ]
     kinds = Counter(
-        text.split(",")[0] if "finished" in text or text == "waiting" else "begun"
+        text.split(",")[0] if "finished" in text or text in ("waiting", "reused") else "begun"
         for text in states
     )
-    done = sum(run.iterations_done() for run in runs)
+    done = sum(
+        run.iterations if source else run.iterations_done()
+        for run, source in zip(runs, sources, strict=True)
+    )
     total = sum(run.iterations for run in runs)
     lines.append(
-        f"{len(runs)} runs: {kinds['finished']} finished, {kinds['begun']} begun, "
+        f"{len(runs)} runs: {kinds['finished']} finished, "
+        + (f"{kinds['reused']} reused, " if reused else "")
+        + f"{kinds['begun']} begun, "
         f"{kinds['waiting']} waiting; {done} of {total} iterations"
     )
     return "\n".join(lines)

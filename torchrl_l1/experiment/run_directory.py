@@ -69,7 +69,7 @@ class RunDirectory:
                     "another directory with run_dir=..."
                 )
             self.check_same(config)
-        elif self.path.exists() and any(f.name not in _BEFORE_CONFIG for f in self.path.iterdir()):
+        elif not self.free():
             raise RunDirectoryError(
                 f"{self.path} is not empty and holds no run; choose another run_dir"
             )
@@ -92,6 +92,12 @@ class RunDirectory:
         assert isinstance(stored, dict)
         return {str(key): value for key, value in stored.items()}
 
+    def free(self) -> bool:
+        """Whether a run may begin here: there is nothing but what one killed at once has left."""
+        if not self.path.exists():
+            return True
+        return self.path.is_dir() and all(f.name in _BEFORE_CONFIG for f in self.path.iterdir())
+
     def held(self) -> bool:
         """Whether a process is running in this directory."""
         lock = self.path / ".lock"
@@ -107,21 +113,11 @@ class RunDirectory:
     def check_same(self, config: dict[str, Any]) -> None:
         """Compare ``config`` with that of the run that the directory holds.
 
-        Settings that the run does not mention, since it is older than they are, have the
-        schema's defaults.
-
         Raises:
-            RunDirectoryError: if a setting differs that touches the result.
+            RunDirectoryError: if a setting differs that touches the result, see
+                :func:`differences`.
         """
-        before, now = flatten(self._stored()), flatten(config)
-        before = {k: v for k, v in schema_defaults().items() if k in now} | before
-        if before.get(_MAY_GROW, 0) < now.get(_MAY_GROW, 0):
-            before[_MAY_GROW] = now[_MAY_GROW]
-        different = [
-            f"{key}: {before.get(key, '(absent)')} there, {now.get(key, '(absent)')} now"
-            for key in sorted(before.keys() | now.keys())
-            if before.get(key) != now.get(key) and key.split(".")[0] not in VOLATILE_KEYS
-        ]
+        different = differences(self._stored(), config, may_grow=True)
         if different:
             raise RunDirectoryError(
                 f"{self.path} holds a run of another configuration:\n  "
@@ -151,6 +147,38 @@ class RunDirectory:
             self.checkpoint_file, weights_only=True, map_location="cpu"
         )
         return state
+
+
+def differences(
+    before: Mapping[str, Any], now: Mapping[str, Any], may_grow: bool = False
+) -> list[str]:
+    """The settings that differ between two runs and touch the result, a text for each.
+
+    Settings that the first run does not mention, since it is older than they are, have the
+    schema's defaults.
+
+    Args:
+        before: configuration of the first run.
+        now: configuration of the second.
+        may_grow: whether the second may have more outer iterations.
+
+    Examples:
+        >>> before = {"seed": 0, "outer_iterations": 2, "run_dir": "here"}
+        >>> now = {"seed": 1, "outer_iterations": 3, "run_dir": "there"}
+        >>> differences(before, now)
+        ['outer_iterations: 2 there, 3 now', 'seed: 0 there, 1 now']
+        >>> differences(before, now, may_grow=True)
+        ['seed: 0 there, 1 now']
+    """
+    before, now = flatten(before), flatten(now)
+    before = {k: v for k, v in schema_defaults().items() if k in now} | before
+    if may_grow and before.get(_MAY_GROW, 0) < now.get(_MAY_GROW, 0):
+        before[_MAY_GROW] = now[_MAY_GROW]
+    return [
+        f"{key}: {before.get(key, '(absent)')} there, {now.get(key, '(absent)')} now"
+        for key in sorted(before.keys() | now.keys())
+        if before.get(key) != now.get(key) and key.split(".")[0] not in VOLATILE_KEYS
+    ]
 
 
 def write_table(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -11,10 +10,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from torchrl_l1.experiment.finding import run_directories
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
 from torchrl_l1.report.reading import (
     SIGNALS,
-    read_config,
     read_evaluations,
     read_metrics,
     read_training_seconds,
@@ -67,7 +66,7 @@ def find_readable_runs(folders: Sequence[Path]) -> Findings:
     for folder in folders:
         if not folder.is_dir():
             raise FileNotFoundError(f"there is no folder {folder}")
-        for path, config in _run_directories(folder):
+        for path, config in run_directories(folder):
             if path.resolve() in seen:
                 continue
             seen.add(path.resolve())
@@ -85,22 +84,6 @@ def find_readable_runs(folders: Sequence[Path]) -> Findings:
             "and, after its first iteration, a metrics.csv"
         )
     return found
-
-
-def _run_directories(folder: Path) -> Iterator[tuple[Path, dict[str, Any] | RunDirectoryError]]:
-    for path, below, files in os.walk(folder):
-        below[:] = sorted(name for name in below if not name.startswith("."))
-        if "config.yaml" not in files:
-            continue
-        config: dict[str, Any] | RunDirectoryError
-        try:
-            config = read_config(Path(path) / "config.yaml")
-        except RunDirectoryError as error:
-            config = error
-        # Any tool may keep a config.yaml; a run's says which task and which seed.
-        if isinstance(config, RunDirectoryError) or ("task" in config and "seed" in config):
-            below.clear()
-            yield Path(path), config
 
 
 def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirectoryError]) -> Run:

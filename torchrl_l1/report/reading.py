@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml  # type: ignore[import-untyped]
-from omegaconf import OmegaConf
 
 from torchrl_l1.experiment.l1_options import controller_label
 from torchrl_l1.experiment.run_directory import RunDirectoryError
@@ -20,7 +18,6 @@ from torchrl_l1.report.numeric_csv import numeric_rows
 __all__ = [
     "SIGNALS",
     "Evaluation",
-    "read_config",
     "read_evaluations",
     "read_metrics",
     "read_training_seconds",
@@ -82,15 +79,6 @@ class Evaluation:
     def tuned(self) -> bool:
         """Whether the test has set any."""
         return self.epsilon is not None or self.alpha is not None
-
-
-def read_config(file: Path) -> dict[str, Any]:
-    """A configuration; empty if the file holds something else than keys and values."""
-    try:
-        config = OmegaConf.to_container(OmegaConf.load(file))
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise RunDirectoryError(f"cannot read {file}: {error}") from error
-    return {str(k): v for k, v in config.items()} if isinstance(config, dict) else {}
 
 
 def read_metrics(file: Path) -> dict[str, np.ndarray]:

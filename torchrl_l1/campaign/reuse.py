@@ -1,0 +1,99 @@
+"""Runs that another campaign has trained with the same settings: copied, not trained again."""
+
+from __future__ import annotations
+
+import filecmp
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from torchrl_l1.campaign.runs import PlannedRun
+from torchrl_l1.campaign.settings import CampaignError
+from torchrl_l1.experiment.finding import read_config, run_directories
+from torchrl_l1.experiment.run_directory import RunDirectory, differences, write_atomically
+
+
+def find_reusable(
+    runs: Sequence[PlannedRun], output: Path, folders: Sequence[Path]
+) -> dict[Path, Path]:
+    """Finished runs with the settings of runs that have not begun; the first one found counts.
+
+    Args:
+        runs: the campaign's.
+        output: the campaign's folder; what is in it is no other campaign's.
+        folders: where to look, with all that is below.
+
+    Returns:
+        where the finished run is, by the run directory that is to be its copy.
+
+    Raises:
+        CampaignError: if a folder does not exist.
+    """
+    for folder in folders:
+        if not folder.is_dir():
+            hint = "; overrides stand before --reuse" if "=" in folder.name else ""
+            raise CampaignError(f"--reuse: there is no folder {folder}{hint}")
+    finished: dict[Any, list[tuple[Path, dict[str, Any]]]] = {}
+    for folder in folders:
+        for path, config in run_directories(folder):
+            place, directory = path.resolve(), RunDirectory(path)
+            if place.is_relative_to(output) or output.is_relative_to(place):
+                continue
+            if isinstance(config, dict) and _finished(directory, config) and not directory.held():
+                finished.setdefault(_key(config), []).append((path, config))
+    reused = {}
+    for run in runs if finished else ():
+        if run.directory.free() and not run.directory.held():
+            now = run.settings()
+            same = [path for path, was in finished.get(_key(now), []) if not differences(was, now)]
+            if same:
+                reused[run.directory.path] = same[0]
+    return reused
+
+
+def copy_run(source: Path, run: PlannedRun) -> None:
+    """Copy a finished run to where it would have been trained; a kill leaves all or nothing.
+
+    Raises:
+        CampaignError: if that fails, or if the run is changed meanwhile.
+    """
+    target = run.directory.path
+    # Reports pass over hidden folders: what a kill leaves is no run.
+    temporary = target.with_name(f".{target.name}.copy")
+    try:
+        shutil.rmtree(temporary, ignore_errors=True)
+        ignored = shutil.ignore_patterns(".lock", "*.tmp")
+        shutil.copytree(source, temporary, symlinks=True, ignore=ignored)
+        copy = RunDirectory(temporary)
+        config = read_config(copy.config_file)
+        if not _finished(copy, config) or differences(config, run.settings()):
+            raise OSError("it has changed meanwhile")
+        _forget_changed_evaluations(source, temporary)
+        config["run_dir"] = str(target)
+        write_atomically(copy.config_file, OmegaConf.to_yaml(OmegaConf.create(config)))
+        if target.exists() and run.directory.free():
+            shutil.rmtree(target)
+        temporary.rename(target)
+    except OSError as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise CampaignError(f"cannot copy {source} to {target}: {error}") from error
+
+
+def _key(config: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Differs only between runs that :func:`differences` tells apart, and is quicker."""
+    return tuple(str(config.get(key)) for key in ("task", "seed", "outer_iterations"))
+
+
+def _finished(directory: RunDirectory, config: Mapping[str, Any]) -> bool:
+    return directory.iterations_done() == config.get("outer_iterations")
+
+
+def _forget_changed_evaluations(source: Path, copy: Path) -> None:
+    """Of a table made again while it was copied, remove the settings: it is then made here too."""
+    for settings in (copy / "evaluations").glob("*.yaml"):
+        names = [settings.with_suffix(".csv").name, settings.name]
+        if filecmp.cmpfiles(source / "evaluations", settings.parent, names, False)[0] != names:
+            settings.unlink()
