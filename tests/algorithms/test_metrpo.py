@@ -119,20 +119,6 @@ def test_imagined_trajectories_start_where_the_configuration_says() -> None:
     assert starts[:30].abs().max() <= 0.01
 
 
-def test_imagined_trajectories_do_not_start_where_they_would_end() -> None:
-    config = tiny(imagined_from_data=0.5, imagined_termination=True)
-    algorithm = METRPO("hopper", config, seed=0, horizon=60)
-    algorithm.store(algorithm.collection.random(0))
-    stored = algorithm.buffer[:]["observation"]
-    ended = algorithm.task.imagined_terminated(stored)
-    assert ended.any() and not ended.all()
-    starts = algorithm.improvement.starts(400, algorithm.buffer)
-    assert starts.shape == (400, 11)
-    assert not algorithm.task.imagined_terminated(starts).any()
-    from_data = (starts[:, None] == stored).all(-1).any(-1)
-    assert from_data.tolist() == [False] * 200 + [True] * 200
-
-
 def test_two_iterations_learn_to_balance() -> None:
     config = METRPOConfig(
         outer_iterations=2,

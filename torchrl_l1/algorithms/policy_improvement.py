@@ -52,7 +52,7 @@ class PolicyImprovement:
             config.imagined_horizon,
             self.action_low,
             self.action_high,
-            self.task.imagined_terminated if config.imagined_termination else None,
+            self.task.terminated if config.imagined_termination else None,
         )
         observation, step = trajectories["observation"], trajectories["step"]
         if config.bootstrap:
@@ -89,17 +89,9 @@ class PolicyImprovement:
         from_data = round(self.config.imagined_from_data * count)
         starts = [self.start_states(count - from_data)]
         if from_data:
-            stored = self._stored_starts(buffer)
-            starts.append(stored[torch.randint(len(stored), (from_data,))])
+            index = torch.randint(len(buffer), (from_data,))
+            starts.append(buffer[index]["observation"])
         return torch.cat(starts).to(self.device)
-
-    def _stored_starts(self, buffer: ReplayBuffer) -> Tensor:
-        """States in the data from which a trajectory can go on."""
-        stored = buffer[:]["observation"]
-        if not self.config.imagined_termination:
-            return stored
-        # Every episode began in a state of this kind.
-        return stored[~self.task.imagined_terminated(stored)]
 
     def state_dict(self) -> dict[str, Any]:
         """What a step leaves behind beside the policy."""

@@ -48,7 +48,6 @@ class Task:
             in torch; ``observation`` is the state *before* the step.
         terminated: ``next_observation (..., n) -> bool (...)`` in torch; never by default.
         reward_in_imagination: reward of imagined rollouts where it is not the real one.
-        terminated_in_imagination: where imagined rollouts may end though episodes do not.
         patch: optional edit of the :class:`mujoco.MjSpec` before it is compiled.
 
     Examples:
@@ -76,18 +75,12 @@ class Task:
     reward: RewardFn
     terminated: Callable[[Tensor], Tensor] = never
     reward_in_imagination: RewardFn | None = None
-    terminated_in_imagination: Callable[[Tensor], Tensor] | None = None
     patch: Callable[[mujoco.MjSpec], None] | None = None
 
     @property
     def imagined_reward(self) -> RewardFn:
         """Reward of imagined rollouts: the real one unless the task says otherwise."""
         return self.reward_in_imagination or self.reward
-
-    @property
-    def imagined_terminated(self) -> Callable[[Tensor], Tensor]:
-        """Where imagined rollouts may end: where episodes do unless the task says otherwise."""
-        return self.terminated_in_imagination or self.terminated
 
     @property
     def dt(self) -> float:

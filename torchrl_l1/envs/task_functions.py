@@ -85,12 +85,6 @@ def hopper_reward(observation: Tensor, action: Tensor, next_observation: Tensor)
     return observation[..., 5] - _control_cost(action) - _height_cost(observation) + 1.0
 
 
-def hopper_fallen(next_observation: Tensor) -> Tensor:
-    """Torso not above 0.7 m, or pitched by 0.2 rad or more: where Gymnasium's episodes end."""
-    height, pitch = next_observation[..., 0], next_observation[..., 1]
-    return (height <= 0.7) | (pitch.abs() >= 0.2)
-
-
 def walker_fallen(next_observation: Tensor) -> Tensor:
     """Torso not between 0.8 and 2 m, or pitched by 1 rad or more."""
     height, pitch = next_observation[..., 0], next_observation[..., 1]

@@ -76,7 +76,6 @@ _HOPPER = Task(
     observe=partial(facts.observe_state, skip=1),
     sample_reset=partial(facts.uniform_reset, half_width=0.005),
     reward=facts.hopper_reward,
-    terminated_in_imagination=facts.hopper_fallen,
 )
 
 # Observation: torso height, pitch, six joint angles, then all velocities; entry 8 is the
