@@ -47,11 +47,29 @@ def test_presets_are_those_of_the_controller(name: str) -> None:
     assert preset.filter_gain == 0.35
 
 
-def test_paper_preset_has_the_published_sizes() -> None:
-    recipe = typed("metrpo/half_cheetah", "preset=paper")
+@pytest.mark.parametrize(
+    ("task", "episodes", "horizon", "policy"),
+    [
+        ("inverted_pendulum", 25, 100, 64),
+        ("swimmer", 6, 200, 32),
+        ("hopper", 6, 1000, 64),
+        ("walker", 6, 1000, 64),
+        ("half_cheetah", 6, 1000, 32),
+    ],
+)
+def test_paper_preset_has_the_published_settings(
+    task: str, episodes: int, horizon: int, policy: int
+) -> None:
+    recipe = typed(f"metrpo/{task}", "preset=paper")
     assert recipe.model.hidden == [1000] * 4
-    assert (recipe.imagined_horizon, recipe.fit.batch_size, recipe.fit.patience) == (1000, 1000, 20)
-    assert recipe.policy.hidden == [32, 32]
+    assert (recipe.fit.batch_size, recipe.fit.patience, recipe.fit.max_epochs) == (1000, 20, 200)
+    assert recipe.policy.hidden == [policy, policy]
+    assert (recipe.policy.std, recipe.policy.normalize) == (1.0, False)
+    assert (recipe.episodes_per_iteration, recipe.imagined_horizon) == (episodes, horizon)
+    assert (recipe.discount, recipe.gae_lambda, recipe.trpo_iterations) == (0.99, 0.95, 20)
+    assert (recipe.trpo.max_kl, recipe.trpo.damping) == (0.01, 0.1)
+    assert (recipe.imagined_from_data, recipe.bootstrap, recipe.box_exit) == (0.0, False, "fail")
+    assert not recipe.imagined_termination
 
 
 @pytest.mark.parametrize(
