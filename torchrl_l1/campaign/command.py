@@ -39,7 +39,7 @@ def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> N
     output = Path(options.output or f"runs/campaigns/{campaign.name}").resolve()
     _check_owner(output, campaign)
     # Runs that are reused need no device, so devices are checked once these are known.
-    runs = plan(campaign, output, elsewhere=True)
+    runs = plan(campaign, output)
     reused = find_reusable(runs, output, [Path(folder) for folder in options.reuse])
     if not (options.launcher and elsewhere(options.launcher)):
         check_devices(campaign, [run for run in runs if run.directory.path not in reused])

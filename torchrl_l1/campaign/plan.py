@@ -27,7 +27,7 @@ from torchrl_l1.experiment.schema import METRPORecipe, l1_config
 from torchrl_l1.experiment.tracking import check_mode
 
 
-def plan(campaign: Campaign, output: Path, elsewhere: bool = False) -> list[PlannedRun]:
+def plan(campaign: Campaign, output: Path) -> list[PlannedRun]:
     """All runs of a campaign, in the order in which they are to be started.
 
     The first seed of every cell comes before the second of any, so that a campaign that is
@@ -36,7 +36,6 @@ def plan(campaign: Campaign, output: Path, elsewhere: bool = False) -> list[Plan
     Args:
         campaign: the campaign.
         output: its folder.
-        elsewhere: whether its runs go to other machines, with other devices than this one's.
 
     Raises:
         CampaignError: for an unknown recipe or option, a setting out of range, an evaluation that
@@ -58,8 +57,6 @@ def plan(campaign: Campaign, output: Path, elsewhere: bool = False) -> list[Plan
     _add_evaluations(campaign, runs)
     for run in runs:
         run.check_directory()
-    if not elsewhere:
-        check_devices(campaign, runs)
     return sorted(runs, key=lambda run: run.round)
 
 
