@@ -20,6 +20,7 @@ from torchrl_l1.report.rendering import (
     training_table,
 )
 from torchrl_l1.report.tables import markdown
+from torchrl_l1.report.time_tables import time_rows, time_table
 from torchrl_l1.report.training_tables import paired_rows, run_rows, training_row
 from torchrl_l1.report.variants import Study
 
@@ -110,11 +111,10 @@ def test_training_row_says_what_l1_did(write_run: WriteRun, tmp_path: Path) -> N
     assert rows["paper"]["switches_per_1000"] == pytest.approx(1000 * np.mean([4.55, 5.05]))
     assert rows["paper"]["u_a"] == pytest.approx(np.mean([1.5, 2.0]))
     assert rows["paper"]["saturation"] == pytest.approx(0.25)
-    assert "switches_per_1000" not in rows["off"] and "ms_per_step" not in rows["paper"]
+    assert "switches_per_1000" not in rows["off"]
     text = training_table(list(rows.values()))
     assert "| switches per 1000 steps | L1 input | saturation |" in text
     assert "| 4800 | 1.75 | 0.25 |" in text
-    assert "ms per step" not in text
     assert "switches" not in training_table([rows["off"]])
 
 
@@ -315,3 +315,20 @@ def test_csv_keeps_full_precision_and_all_columns(tmp_path: Path) -> None:
         first, second = csv.DictReader(file)
     assert float(first["a"]) == 1 / 3
     assert (first["b"], second["b"]) == ("", "x, y")
+
+
+def test_time_rows_are_medians_of_finished_runs(write_run: WriteRun, tmp_path: Path) -> None:
+    def timings(*fits: float) -> list[dict[str, float]]:
+        rest = {"random": 0.5, "trpo": 2.0, "collect": 0.25, "evaluate": 100.0}
+        return [{"iteration": i, "fit": fit, **rest} for i, fit in enumerate(fits)]
+
+    write_run([1, 2], "l1=off", seed=0, timings=timings(1, 9), steps=1000)
+    write_run([1, 2], "l1=off", seed=1, timings=timings(3, 5), steps=1000)
+    write_run([1], "l1=off", "outer_iterations=2", seed=2, timings=timings(77), steps=1000)
+    write_run([1, 2], "l1=paper", seed=0)
+    (row,) = time_rows(study(tmp_path))
+    assert (row["l1"], row["runs"]) == ("off", 2)
+    assert (row["fit"], row["trpo"], row["collect"], row["evaluate"]) == (4.0, 2.0, 0.25, 100.0)
+    # (1 + 9) / 2 or (3 + 5) / 2, and 2.75 for the other phases, in 1500 steps an iteration.
+    assert row["ms_per_step"] == pytest.approx(1000 * np.mean([15.5, 13.5]) / 3000)
+    assert "| inverted_pendulum | none | off | 2 | 4 | 2 | 0.25 | 100 | 4.83 |" in time_table([row])

@@ -14,9 +14,10 @@ from torchrl_l1.experiment.finding import run_directories
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
 from torchrl_l1.report.reading import (
     SIGNALS,
+    TRAINING_PHASES,
     read_evaluations,
     read_metrics,
-    read_training_seconds,
+    read_seconds,
     read_versions,
 )
 from torchrl_l1.report.runs import Evaluation, Run
@@ -119,8 +120,8 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
         columns["return_deterministic"],
         {name: columns[name] for name in SIGNALS},
         readable(
-            partial(read_training_seconds, directory.timing_file, iterations),
-            np.full(iterations, np.nan),
+            partial(read_seconds, directory.timing_file, iterations),
+            {phase: np.full(iterations, np.nan) for phase in TRAINING_PHASES},
         ),
         readable(partial(read_versions, path / "versions.json"), {}),
         {name: tests for name, tests in evaluations.items() if tests},

@@ -17,10 +17,11 @@ from torchrl_l1.report.numeric_csv import numeric_rows
 
 __all__ = [
     "SIGNALS",
+    "TRAINING_PHASES",
     "Evaluation",
     "read_evaluations",
     "read_metrics",
-    "read_training_seconds",
+    "read_seconds",
     "read_versions",
 ]
 
@@ -31,7 +32,9 @@ SIGNALS = (_SWITCH_RATE, "l1/u_a", "l1/saturation")
 
 _METRICS = ("iteration", "real_steps", "return_mean", "return_deterministic")
 _NUMBERS = ("bias", "gain", "return_mean", "episodes")
-_TRAINING_PHASES = ("random", "fit", "trpo", "collect")
+
+TRAINING_PHASES = ("random", "fit", "trpo", "collect", "evaluate")
+"""Columns of a ``timing.csv``, in the order in which an outer iteration goes through them."""
 
 
 @dataclass(frozen=True)
@@ -93,11 +96,14 @@ def read_metrics(file: Path) -> dict[str, np.ndarray]:
     return columns
 
 
-def read_training_seconds(file: Path, iterations: int) -> np.ndarray:
-    """Seconds of fit, TRPO and collection in each iteration; NaN where they are not known."""
-    rows = _rows(file, ("iteration",), optional=_TRAINING_PHASES) if file.exists() else []
-    seconds = {int(row["iteration"]): sum(row[k] for k in _TRAINING_PHASES) for row in rows}
-    return np.array([seconds.get(index, np.nan) for index in range(iterations)])
+def read_seconds(file: Path, iterations: int) -> dict[str, np.ndarray]:
+    """Seconds of each of the :data:`TRAINING_PHASES` in each iteration; NaN where not known."""
+    rows = _rows(file, ("iteration",), optional=TRAINING_PHASES) if file.exists() else []
+    found = {int(row["iteration"]): row for row in rows}
+    return {
+        phase: np.array([found.get(i, {}).get(phase, np.nan) for i in range(iterations)])
+        for phase in TRAINING_PHASES
+    }
 
 
 def read_evaluations(file: Path) -> list[Evaluation]:

@@ -32,7 +32,6 @@ def training_table(rows: Sequence[Row]) -> str:
             "switches per 1000 steps": number(row.get("switches_per_1000")),
             "L1 input": number(row.get("u_a")),
             "saturation": number(row.get("saturation")),
-            "ms per step": number(row.get("ms_per_step")),
             "paper": _paper(row, notes),
             "authors' logs": _spread(row.get("authors_mean"), row.get("authors_spread")),
             "unfinished": row["unfinished"],

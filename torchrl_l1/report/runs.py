@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_l1.report.reading import Evaluation
+from torchrl_l1.report.reading import TRAINING_PHASES, Evaluation
 from torchrl_l1.report.settings import Identity
-from torchrl_l1.report.statistics import WINDOW, final_return
+from torchrl_l1.report.statistics import final_return
 
 __all__ = ["Evaluation", "Run"]
 
@@ -27,7 +27,7 @@ class Run:
         returns: mean return ``(T,)`` of the stochastic policy.
         deterministic: mean return ``(T,)`` with the policy's mean action.
         signals: ``(T,)`` each: what L1 did, see ``SIGNALS``; NaN without L1.
-        training_seconds: wall-clock time ``(T,)`` of fit, TRPO and collection; NaN if unknown.
+        seconds: wall-clock time ``(T,)`` of each phase, see ``TRAINING_PHASES``; NaN if unknown.
         versions: what it ran with.
         evaluations: by name of the evaluation.
     """
@@ -38,7 +38,7 @@ class Run:
     returns: np.ndarray
     deterministic: np.ndarray
     signals: Mapping[str, np.ndarray]
-    training_seconds: np.ndarray
+    seconds: Mapping[str, np.ndarray]
     versions: dict[str, str] = field(default_factory=dict)
     evaluations: dict[str, list[Evaluation]] = field(default_factory=dict)
 
@@ -67,8 +67,13 @@ class Run:
         return float(final_return(self.signals[name]))
 
     @property
+    def training_seconds(self) -> np.ndarray:
+        """Time ``(T,)`` of random data, fit, TRPO and collection; NaN if unknown."""
+        *phases, _ = TRAINING_PHASES
+        return np.sum([self.seconds[phase] for phase in phases], axis=0)
+
+    @property
     def milliseconds_per_step(self) -> float:
-        """Training time per real step over the last three outer iterations; NaN if unknown."""
-        begun = self.real_steps[-WINDOW - 1] if len(self.real_steps) > WINDOW else 0
-        steps = self.real_steps[-1] - begun if len(self.real_steps) else 0
-        return float(1000 * self.training_seconds[-WINDOW:].sum() / steps) if steps else math.nan
+        """Training time per real step; NaN if unknown."""
+        steps = self.real_steps[-1] if len(self.real_steps) else 0
+        return float(1000 * self.training_seconds.sum() / steps) if steps else math.nan

@@ -7,6 +7,7 @@ from torchrl_l1.report.page import Page, slug
 from torchrl_l1.report.reference_curves import ReferenceCurves
 from torchrl_l1.report.rendering import paired_table, training_table
 from torchrl_l1.report.style import title
+from torchrl_l1.report.time_tables import time_rows, time_table
 from torchrl_l1.report.training_tables import paired_rows, training_row
 from torchrl_l1.report.variants import Study
 
@@ -19,6 +20,7 @@ def training_sections(page: Page, study: Study, reference: ReferenceCurves | Non
     _pairs(page, study)
     _curves(page, study, reference)
     _comparisons(page, study, reference)
+    _time(page, study)
 
 
 def _training(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
@@ -28,9 +30,8 @@ def _training(page: Page, study: Study, reference: ReferenceCurves | None) -> No
         "Return is the mean over seeds of the mean over the last three outer iterations, of "
         "sampled actions as in the paper; the spread is the paper's ± (standard deviation over "
         "seeds in each of these iterations, averaged), the interval that of the mean over seeds. "
-        "What L1 did (switches, mean norm of its input, share of actions that a bound cut) and "
-        "training time per real step, without the episodes that only measure returns, are means "
-        "over the same iterations.",
+        "What L1 did (switches, mean norm of its input, share of actions that a bound cut) are "
+        "means over the same iterations.",
     )
     page.text(training_table([row for cell, row in rows.items() if not cell.variant]))
     page.text(_main_settings(study))
@@ -102,3 +103,17 @@ def _comparisons(page: Page, study: Study, reference: ReferenceCurves | None) ->
             name = page.folder / f"by_{slug(keys)}_{task}.png"
             figure = plot_comparison(study, task, keys, name, reference)
             page.figure(figure, f"Learning curves by {', '.join(keys)}, {title(task)}")
+
+
+def _time(page: Page, study: Study) -> None:
+    rows = time_rows(study)
+    if not rows:
+        return
+    page.heading(
+        "Where the time goes",
+        "Wall-clock seconds of an outer iteration in each of its phases, medians over all "
+        "iterations of the finished runs, and the mean training time per real step. The times are "
+        "those of the machine, with whatever else it did.",
+    )
+    page.text(time_table(rows))
+    page.csv("time", rows)

@@ -139,12 +139,11 @@ def _summary(name: str, values: Sequence[float]) -> dict[str, Any]:
 
 
 def _signals(runs: Sequence[Run]) -> dict[str, float]:
-    """What L1 did and what training took, over the last three iterations; what is known of it."""
+    """What L1 did, over the last three iterations; what is known of it."""
     values = {
         "switches_per_1000": [1000 * run.final_signal("l1/switch_rate") for run in runs],
         "u_a": [run.final_signal("l1/u_a") for run in runs],
         "saturation": [run.final_signal("l1/saturation") for run in runs],
-        "ms_per_step": [run.milliseconds_per_step for run in runs],
     }
     means = {name: float(np.mean(numbers)) for name, numbers in values.items()}
     return {name: mean for name, mean in means.items() if np.isfinite(mean)}
