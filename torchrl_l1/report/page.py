@@ -41,7 +41,7 @@ class Page:
         """Write a table in full precision and name it."""
         file = self.folder / f"{name}.csv"
         write_table(file, rows)
-        self.text(f"All columns: [{file.name}]({file.name}).")
+        self.text(f"All columns: [{file.name}](./{file.name}).")
 
     def figure(self, file: Path | None, caption: str) -> None:
         """Show a figure; nothing if there was nothing to draw."""
