@@ -76,7 +76,7 @@ def test_report_joins_tables_and_figures(campaign: Path, tmp_path: Path) -> None
         assert matplotlib.image.imread(page.parent / figure).std() > 0.05
     names = ("runs", "training", "pairs", "sim_to_real", "ablation", "disturbances", "my_own")
     for name in (*names, "versions"):
-        assert f"({name}.csv)" in text
+        assert f"(./{name}.csv)" in text
         with (page.parent / f"{name}.csv").open() as file:
             assert list(csv.DictReader(file)), name
     for heading in ("Training", "L1 less baseline", "By `model.form`", "Sim to real", "Versions"):
