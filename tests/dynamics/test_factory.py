@@ -66,3 +66,12 @@ def test_settings_reach_both_forms() -> None:
 def test_an_unknown_form_is_named() -> None:
     with pytest.raises(ValueError, match="'nonlinear' or 'affine', got 'linear'"):
         make_dynamics(3, 2, "linear")
+
+
+@pytest.mark.parametrize(("n", "m"), [(4, 1), (18, 6)])
+def test_affine_model_with_a_gaussian_head_has_the_size_too(n: int, m: int) -> None:
+    nonlinear = make_dynamics(n, m, "nonlinear", [128, 128], head="gaussian", members=1)
+    affine = make_dynamics(n, m, "affine", [128, 128], head="gaussian", members=1)
+    assert nonlinear.network.weights[-1].shape[-1] == 2 * n
+    assert affine.network.weights[-1].shape[-1] == 2 * n * (1 + m)
+    assert abs(count(affine) / count(nonlinear) - 1) < 0.02

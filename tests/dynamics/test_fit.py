@@ -3,10 +3,17 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
-from torchrl_l1.dynamics import EnsembleDynamics, EnsembleDynamicsLoss, FitConfig, fit_ensemble
+from torchrl_l1.dynamics import (
+    EnsembleDynamics,
+    EnsembleDynamicsLoss,
+    FitConfig,
+    Head,
+    evaluate_members,
+    fit_ensemble,
+    make_dynamics,
+)
 
 
 def transitions(count: int, noise: float = 0.0) -> TensorDict:
@@ -95,32 +102,31 @@ def test_each_member_sees_its_own_shuffle() -> None:
     assert difference(160) < 1e-5  # all the training data in each batch
 
 
-class GaussianHead(nn.Module):
-    """Mean and logarithm of the variance."""
+class AbsoluteError(Head):
+    """A user's own head: the mean, and a column that is not used."""
 
     def out_features(self, dim: int) -> int:
-        return 2 * dim
+        return dim + 1
 
     def loss(self, raw: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        mean, log_variance = raw.chunk(2, -1)
-        return ((mean - target).square() * (-log_variance).exp() + log_variance).sum(-1)
+        return (raw[..., :-1] - target).abs().sum(-1)
+
+    def standard_deviation(self, raw: torch.Tensor) -> torch.Tensor:
+        return torch.zeros_like(raw[..., :-1])
 
 
 def test_another_head_sets_width_and_loss() -> None:
     torch.manual_seed(0)
-    model = EnsembleDynamics(2, 1, members=3, hidden=(8,), activation="tanh", head=GaussianHead())
-    assert model.network.weights[-1].shape == (3, 8, 4)
+    model = EnsembleDynamics(2, 1, members=3, hidden=(8,), activation="tanh", head=AbsoluteError())
+    assert model.network.weights[-1].shape == (3, 8, 3)
     data = transitions(30)
     change = data["next", "observation"] - data["observation"]
     model.fit_statistics(data["observation"], data["action"], change)
     raw = model.network(model.normalize_inputs(data["observation"], data["action"]))
     target = model.change_normalizer.normalize(change)
-    # Twice torch's own negative log-likelihood, which leaves out the same constant.
-    expected = 2 * nn.functional.gaussian_nll_loss(
-        raw[..., :2], target.expand(3, -1, -1), raw[..., 2:].exp(), reduction="none"
-    ).sum(-1).mean(-1)
+    expected = (raw[..., :2] - target).abs().sum(-1).mean(-1)
     out = EnsembleDynamicsLoss(model)(data)
-    torch.testing.assert_close(out["member_loss"], expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(out["member_loss"], expected)
     mean = model.change_normalizer.denormalize(raw[..., :2])
     torch.testing.assert_close(model.member_changes(data["observation"], data["action"]), mean)
     _, jacobian = model.value_and_jacobian(data["observation"], data["action"])
@@ -167,3 +173,130 @@ def test_nothing_to_validate_on_is_an_error() -> None:
     data["validation"][:] = False
     with pytest.raises(ValueError, match="0 validation"):
         fitted("action", FitConfig(), data)
+
+
+class RecordingHead(Head):
+    """Keeps the targets ``(E, B, dim)`` of each gradient step."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[torch.Tensor] = []
+
+    def out_features(self, dim: int) -> int:
+        return dim
+
+    def loss(self, raw: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        if raw.requires_grad:
+            self.seen.append(target)
+        return (raw - target).square().mean(-1)
+
+    def standard_deviation(self, raw: torch.Tensor) -> torch.Tensor:
+        return torch.zeros_like(raw)
+
+
+def fit_once(
+    model: EnsembleDynamics, data: TensorDict, config: FitConfig, sgd: bool = False
+) -> float:
+    buffer = ReplayBuffer(storage=LazyTensorStorage(len(data)))
+    buffer.extend(data)
+    kind = torch.optim.SGD if sgd else torch.optim.Adam
+    optimizer = kind(model.parameters(), lr=config.learning_rate)
+    return fit_ensemble(model, buffer, config, optimizer).validation_loss
+
+
+@pytest.mark.parametrize(("bootstrap", "share"), [(True, 0.632), (False, 1.0)])
+def test_a_bootstrapped_member_trains_on_two_thirds(bootstrap: bool, share: float) -> None:
+    torch.manual_seed(0)
+    head = RecordingHead()
+    model = EnsembleDynamics(2, 1, members=3, hidden=(4,), head=head)
+    data = transitions(2500)
+    config = FitConfig(batch_size=100, max_epochs=2, bootstrap=bootstrap)
+
+    def samples() -> list[set[float]]:
+        head.seen.clear()
+        fit_once(model, data, config)
+        steps = torch.cat(head.seen, 1)
+        assert steps.shape[1] == 2 * 2000
+        first, second = (steps[:, :2000], steps[:, 2000:])
+        # Both epochs go through the same resample, repetitions included.
+        assert torch.equal(first.sort(1).values, second.sort(1).values)
+        return [set(member[:, 0].tolist()) for member in first]
+
+    members, again = samples(), samples()
+    for member, other in zip(members + again, members[1:] + again + members[:1], strict=True):
+        assert len(member) / 2000 == pytest.approx(share, abs=0.03)
+        # Resamples are independent, of members and of fits.
+        assert len(member & other) / 2000 == pytest.approx(share**2, abs=0.04)
+
+
+@pytest.mark.parametrize("form", ["nonlinear", "affine"])
+def test_weight_decay_pulls_each_layer_by_its_coefficient(form: str) -> None:
+    data = transitions(50)
+    coefficients = [0.3, 0.0, 0.7]
+    fits = []
+    for weight_decay in ([], coefficients):
+        torch.manual_seed(0)
+        model = make_dynamics(2, 1, form, hidden=(5, 4), members=2, activation="tanh")
+        before = [weight.detach().clone() for weight in model.network.weights]
+        config = FitConfig(0.1, max_gradient_steps=1, weight_decay=weight_decay)
+        fit_once(model, data, config, sgd=True)
+        fits.append([*model.network.weights, *model.network.biases])
+    pulls = [0.1 * c * weight for c, weight in zip(coefficients, before, strict=True)]
+    for without, decayed, pull in zip(*fits, [*pulls, 0, 0, 0], strict=True):
+        torch.testing.assert_close(decayed, without - pull)
+
+
+def test_the_best_members_are_kept_as_elites() -> None:
+    torch.manual_seed(0)
+    data = transitions(200)
+    for head in ("deterministic", "gaussian"):
+        model = make_dynamics(2, 1, hidden=(8,), members=5, head=head)
+        reported = fit_once(model, data, FitConfig(max_epochs=3, batch_size=40, elites=2))
+        losses = evaluate_members(EnsembleDynamicsLoss(model), data[data["validation"]])
+        assert model.elites.tolist() == sorted(losses.argsort()[:2].tolist())
+        assert reported == pytest.approx(losses.mean().item(), rel=1e-5)
+        kept = model.elites.clone()
+        fit_once(model, data, FitConfig(max_epochs=1))
+        assert torch.equal(model.elites, kept)
+
+
+def test_a_fit_by_default_draws_its_shuffles_and_nothing_else() -> None:
+    data = transitions(100)
+    model = EnsembleDynamics(2, 1, members=3, hidden=(4,))
+    torch.manual_seed(1)
+    fit_once(model, data, FitConfig(max_epochs=2))
+    after = torch.get_rng_state()
+    torch.manual_seed(1)
+    for _ in range(2 * 3):
+        torch.randperm(80)
+    assert torch.equal(torch.get_rng_state(), after)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"weight_decay": [0.1]}, "each of the model's 2 layers, the output layer included, got 1"),
+        ({"elites": 3}, "fit.elites is 3, but the model has 2 members"),
+    ],
+)
+def test_settings_that_do_not_fit_the_model_leave_it_alone(
+    settings: dict[str, object], message: str
+) -> None:
+    model = EnsembleDynamics(2, 1, members=2, hidden=(4,))
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    with pytest.raises(ValueError, match=message):
+        fit_once(model, transitions(50), FitConfig(**settings))  # type: ignore[arg-type]
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"weight_decay": [0.1, -1.0]}, "fit.weight_decay must hold finite"),
+        ({"weight_decay": [float("nan")]}, "fit.weight_decay must hold finite"),
+        ({"elites": 0}, "fit.elites must be at least 1"),
+    ],
+)
+def test_impossible_settings_are_named(settings: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        FitConfig(**settings)  # type: ignore[arg-type]

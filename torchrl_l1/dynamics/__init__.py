@@ -3,8 +3,9 @@
 from torchrl_l1.dynamics.control_affine import ControlAffineDynamics
 from torchrl_l1.dynamics.ensemble import EnsembleMLP
 from torchrl_l1.dynamics.factory import MODEL_FORMS, make_dynamics, matched_hidden
-from torchrl_l1.dynamics.fit import FitConfig, FitReport, evaluate_members, fit_ensemble
-from torchrl_l1.dynamics.heads import DeterministicHead, Head
+from torchrl_l1.dynamics.fit import FitReport, evaluate_members, fit_ensemble
+from torchrl_l1.dynamics.fit_config import FitConfig
+from torchrl_l1.dynamics.heads import HEADS, DeterministicHead, GaussianHead, Head, make_head
 from torchrl_l1.dynamics.imagination import imagine
 from torchrl_l1.dynamics.loss import EnsembleDynamicsLoss
 from torchrl_l1.dynamics.model import EnsembleDynamics
@@ -12,6 +13,7 @@ from torchrl_l1.dynamics.model_env import EnsembleModelEnv, EnsembleWorldModel
 from torchrl_l1.dynamics.normalizer import DataBox, Normalizer
 
 __all__ = [
+    "HEADS",
     "MODEL_FORMS",
     "ControlAffineDynamics",
     "DataBox",
@@ -23,11 +25,13 @@ __all__ = [
     "EnsembleWorldModel",
     "FitConfig",
     "FitReport",
+    "GaussianHead",
     "Head",
     "Normalizer",
     "evaluate_members",
     "fit_ensemble",
     "imagine",
     "make_dynamics",
+    "make_head",
     "matched_hidden",
 ]

@@ -15,7 +15,8 @@ class ControlAffineDynamics(EnsembleDynamics):
     r"""Control-affine ensemble model, :math:`x_{t+1} - x_t = f(x_t) + G(x_t)\, u_t`.
 
     Each member is a network of the observation alone, with the offset :math:`f` and the columns
-    of the gain :math:`G` as its outputs: ``n + n m`` of them for the deterministic head. In
+    of the gain :math:`G` as its outputs: ``n + n m`` of them for the deterministic head, twice as
+    many for the Gaussian one, whose raw log-variance then is affine in the action too. In
     arXiv 2403.14860, figure 2, whose baseline this is, they are two networks. All else is as in
     :class:`EnsembleDynamics`: arguments, normalisers, data box, members, fit. The Jacobian is
     the ensemble's mean gain whatever the action, so the switching law never fires.
@@ -60,7 +61,7 @@ class ControlAffineDynamics(EnsembleDynamics):
         """
         inputs = self.normalize_inputs(observation, action)
         flat, scaled_action = self._split(inputs.reshape(-1, inputs.shape[-1]))
-        offset, gain = self._coefficients(self.network(flat).mean(0))
+        offset, gain = self._coefficients(self._over_elites(self.network(flat)))
         n, m = self.observation_dim, self.action_dim
         value = _affine(offset, gain, scaled_action)[..., :n]
         jacobian = gain[..., :n].transpose(-2, -1)

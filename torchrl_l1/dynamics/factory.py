@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 from torchrl_l1.dynamics.control_affine import ControlAffineDynamics
+from torchrl_l1.dynamics.heads import Head, make_head
 from torchrl_l1.dynamics.model import EnsembleDynamics
 
 MODEL_FORMS = ("nonlinear", "affine")
@@ -17,6 +18,7 @@ def make_dynamics(
     action_dim: int,
     form: str = "nonlinear",
     hidden: Sequence[int] = (256, 256),
+    head: str | Head = "deterministic",
     **settings: Any,
 ) -> EnsembleDynamics:
     """An ensemble of the given form, of a size set by ``hidden`` whatever the form.
@@ -28,10 +30,11 @@ def make_dynamics(
             :class:`ControlAffineDynamics` matched to it by parameter count, see
             :func:`matched_hidden`.
         hidden: widths of the nonlinear model's hidden layers.
+        head: ``"deterministic"`` or ``"gaussian"``, see :func:`make_head`, or a :class:`Head`.
         settings: further arguments of :class:`EnsembleDynamics`.
 
     Raises:
-        ValueError: for another form.
+        ValueError: for another form or head.
 
     Examples:
         >>> make_dynamics(4, 1, "affine", hidden=(128, 128)).network.weights[0].shape
@@ -40,23 +43,31 @@ def make_dynamics(
     if form not in MODEL_FORMS:
         allowed = " or ".join(map(repr, MODEL_FORMS))
         raise ValueError(f"form must be {allowed}, got {form!r}")
+    if isinstance(head, str):
+        head = make_head(head, observation_dim)
+    settings = {**settings, "head": head}
     if form == "affine":
-        hidden = matched_hidden(observation_dim, action_dim, hidden)
+        outputs = head.out_features(observation_dim)
+        hidden = matched_hidden(observation_dim, action_dim, hidden, outputs)
         return ControlAffineDynamics(observation_dim, action_dim, hidden=hidden, **settings)
     return EnsembleDynamics(observation_dim, action_dim, hidden=hidden, **settings)
 
 
-def matched_hidden(observation_dim: int, action_dim: int, hidden: Sequence[int]) -> list[int]:
+def matched_hidden(
+    observation_dim: int, action_dim: int, hidden: Sequence[int], outputs: int | None = None
+) -> list[int]:
     """Hidden widths of a control-affine network with as many parameters as a nonlinear one.
 
-    The control-affine network has n (1 + m) outputs in place of n, and m inputs less. All
-    widths are scaled by one factor, the one that brings the number of weights and biases
-    closest to that of a network from n + m inputs through ``hidden`` to n outputs.
+    The control-affine network has 1 + m times the outputs, and m inputs less. All widths are
+    scaled by one factor, the one that brings the number of weights and biases closest to that
+    of a network from n + m inputs through ``hidden`` to the outputs.
 
     Args:
         observation_dim: number of observations, n.
         action_dim: number of actions, m.
         hidden: widths of the nonlinear network's hidden layers.
+        outputs: width of the nonlinear network's output; n, that of the deterministic head, if
+            ``None``.
 
     Examples:
         >>> matched_hidden(18, 6, [256, 256])
@@ -65,13 +76,14 @@ def matched_hidden(observation_dim: int, action_dim: int, hidden: Sequence[int])
     n, m = observation_dim, action_dim
     if not hidden:
         return []
-    target = _parameters([n + m, *hidden, n])
+    out = n if outputs is None else outputs
+    target = _parameters([n + m, *hidden, out])
 
     def scaled(widest: int) -> list[int]:
         return [max(1, round(width * widest / max(hidden))) for width in hidden]
 
     def difference(widest: int) -> int:
-        return abs(_parameters([n, *scaled(widest), n * (1 + m)]) - target)
+        return abs(_parameters([n, *scaled(widest), out * (1 + m)]) - target)
 
     # The number of parameters grows with the width, so the difference has a single minimum.
     widest = 1

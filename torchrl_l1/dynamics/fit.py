@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,56 +10,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 
+from torchrl_l1.dynamics.fit_config import FitConfig
 from torchrl_l1.dynamics.loss import EnsembleDynamicsLoss
 from torchrl_l1.dynamics.model import EnsembleDynamics
-
-
-@dataclass
-class FitConfig:
-    """How an ensemble is fitted.
-
-    Attributes:
-        learning_rate: Adam's step size at the start of a fit.
-        final_learning_rate_fraction: the step size at the end as a fraction of that at the
-            start, reached linearly over the gradient steps that a fit may take.
-        batch_size: transitions per member and gradient step.
-        max_epochs: passes over the training data.
-        max_gradient_steps: bound on gradient steps, whatever the number of epochs.
-        patience: epochs without a lower validation loss of any member before stopping.
-        validation_fraction: share of new transitions kept out of training for good.
-        weight_penalty: coefficient of half the squared hidden weights, divided by the number
-            of training transitions.
-    """
-
-    learning_rate: float = 1e-3
-    final_learning_rate_fraction: float = 0.1
-    batch_size: int = 500
-    max_epochs: int = 50
-    max_gradient_steps: int = 800
-    patience: int = 5
-    validation_fraction: float = 0.1
-    weight_penalty: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Refuse settings that could only fail later.
-
-        Raises:
-            ValueError: naming the setting.
-        """
-        for name in ("batch_size", "max_epochs", "max_gradient_steps", "patience"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"fit.{name} must be at least 1, got {getattr(self, name)}")
-        if not 0 < self.validation_fraction < 1:
-            raise ValueError(
-                f"fit.validation_fraction must be between 0 and 1, got {self.validation_fraction}"
-            )
-        if self.learning_rate <= 0:
-            raise ValueError(f"fit.learning_rate must be positive, got {self.learning_rate}")
-        if not 0 < self.final_learning_rate_fraction <= 1:
-            raise ValueError(
-                "fit.final_learning_rate_fraction must be positive and at most 1, got "
-                f"{self.final_learning_rate_fraction}"
-            )
 
 
 @dataclass
@@ -102,7 +55,8 @@ def fit_ensemble(
 
     Normalisers and the data box are set from the training data first. The weights are warm:
     they continue from where they are. Every member keeps the weights of the epoch with its
-    lowest validation loss.
+    lowest validation loss, parameters that the members share those of the last epoch that was the
+    best for any of them.
 
     Args:
         dynamics: the model, changed in place.
@@ -114,8 +68,10 @@ def fit_ensemble(
         on_epoch: called with the number of the finished epoch, for progress bars.
 
     Raises:
-        ValueError: if there is nothing to train or to validate on.
+        ValueError: if there is nothing to train or to validate on, or if a setting does not fit
+            the model. The model is as it was then.
     """
+    _check(config, dynamics)
     device = next(dynamics.parameters()).device
     train, validation = (part.to(device) for part in _split(buffer, action_key))
     dynamics.train()
@@ -127,7 +83,9 @@ def fit_ensemble(
     batch_size = min(config.batch_size, size)
     batches = size // batch_size
     best_loss = torch.full((members,), torch.inf, device=device)
-    best_weights = [parameter.detach().clone() for parameter in dynamics.parameters()]
+    own, shared = list(dynamics.network.parameters()), list(dynamics.head.parameters())
+    best_own, best_shared = _copy(own), _copy(shared)
+    resample = torch.randint(size, (members, size)).to(device) if config.bootstrap else None
     planned = min(config.max_epochs * batches, config.max_gradient_steps)
     stale = epoch = steps = 0
     while epoch < config.max_epochs and steps < config.max_gradient_steps:
@@ -135,10 +93,15 @@ def fit_ensemble(
         running = torch.zeros((), device=device)
         for batch in range(batches):
             index = order[:, batch * batch_size : (batch + 1) * batch_size]
-            objective = loss(train[index])["loss_dynamics"]
-            running += objective.detach()
+            if resample is not None:
+                index = resample.gather(1, index)
+            losses = loss(train[index])
+            objective = losses["loss_dynamics"]
+            running += losses["member_loss"].sum()
             if config.weight_penalty:
                 objective = objective + config.weight_penalty * _penalty(dynamics) / size
+            if config.weight_decay:
+                objective = objective + _decay(dynamics, config.weight_decay)
             decay = 1 - (1 - config.final_learning_rate_fraction) * steps / planned
             for group in optimizer.param_groups:
                 group["lr"] = config.learning_rate * decay
@@ -152,22 +115,48 @@ def fit_ensemble(
         current = evaluate_members(loss, validation)
         better = current < best_loss
         best_loss = torch.where(better, current, best_loss)
-        for kept, parameter in zip(best_weights, dynamics.parameters(), strict=True):
+        for kept, parameter in zip(best_own, own, strict=True):
             kept[better] = parameter.detach()[better]
         if on_epoch is not None:
             on_epoch(epoch)
-        stale = 0 if better.any() else stale + 1
+        improved = bool(better.any())
+        best_shared = _copy(shared) if improved else best_shared
+        stale = 0 if improved else stale + 1
         if stale >= config.patience:
             break
     with torch.no_grad():
-        for kept, parameter in zip(best_weights, dynamics.parameters(), strict=True):
+        for kept, parameter in zip(best_own + best_shared, own + shared, strict=True):
             parameter.copy_(kept)
+    if shared:  # the best weights of each member now meet parameters of another epoch
+        best_loss = evaluate_members(loss, validation)
+    if config.elites is not None:
+        dynamics.set_elites(best_loss.topk(config.elites, largest=False).indices)
     return FitReport(
         train_loss=running.item() / (members * (batch + 1)),
         validation_loss=best_loss.mean().item(),
         epochs=epoch,
         gradient_steps=steps,
     )
+
+
+def _check(config: FitConfig, dynamics: EnsembleDynamics) -> None:
+    layers, members = len(dynamics.network.weights), dynamics.members
+    if config.weight_decay and len(config.weight_decay) != layers:
+        raise ValueError(
+            f"fit.weight_decay must hold a coefficient for each of the model's {layers} layers, "
+            f"the output layer included, got {len(config.weight_decay)}"
+        )
+    if config.elites is not None and config.elites > members:
+        raise ValueError(f"fit.elites is {config.elites}, but the model has {members} members")
+
+
+def _copy(parameters: Sequence[Tensor]) -> list[Tensor]:
+    return [parameter.detach().clone() for parameter in parameters]
+
+
+def _decay(dynamics: EnsembleDynamics, coefficients: Sequence[float]) -> Tensor:
+    layers = zip(coefficients, dynamics.network.weights, strict=True)
+    return 0.5 * torch.stack([c * weight.square().sum() for c, weight in layers]).sum()
 
 
 def _penalty(dynamics: EnsembleDynamics) -> Tensor:

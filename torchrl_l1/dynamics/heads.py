@@ -2,28 +2,42 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+import math
+from abc import ABC, abstractmethod
 
+import torch
 from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+HEADS = ("deterministic", "gaussian")
 
 
-class Head(Protocol):
-    """Meaning of a member's raw output for targets of ``dim`` columns.
+class Head(nn.Module, ABC):
+    """Meaning of a member's raw output for targets of ``dim`` columns, normalised units.
 
     The predicted mean must be the first ``dim`` columns of the raw output, unchanged, so that
-    the Jacobian of the mean is that of those columns.
+    the Jacobian of the mean is that of those columns. The members of an ensemble share the
+    head, and with it the parameters that it may have.
     """
 
+    @abstractmethod
     def out_features(self, dim: int) -> int:
         """Width of the raw output."""
-        ...
 
+    @abstractmethod
     def loss(self, raw: Tensor, target: Tensor) -> Tensor:
         """Training loss per sample, ``(..., out)`` and ``(..., dim)`` to ``(...,)``."""
-        ...
+
+    @abstractmethod
+    def standard_deviation(self, raw: Tensor) -> Tensor:
+        """Predicted standard deviation of the target, ``(..., out)`` to ``(..., dim)``."""
+
+    def penalty(self) -> Tensor | float:
+        """What the head's own parameters add to the objective of a fit, once per ensemble."""
+        return 0.0
 
 
-class DeterministicHead(nn.Module):
+class DeterministicHead(Head):
     """The raw output is the predicted mean; trained with the mean squared error."""
 
     def out_features(self, dim: int) -> int:
@@ -33,3 +47,114 @@ class DeterministicHead(nn.Module):
     def loss(self, raw: Tensor, target: Tensor) -> Tensor:
         """Squared error averaged over the target's columns (arXiv 2403.14860, section 3.1)."""
         return (raw - target).square().mean(-1)
+
+    def standard_deviation(self, raw: Tensor) -> Tensor:
+        """Zero: the prediction is a point."""
+        return torch.zeros_like(raw)
+
+
+class GaussianHead(Head):
+    r"""Means and log-variances of independent normal distributions; trained by likelihood.
+
+    The first ``dim`` columns of the raw output are the mean, the others, :math:`v`, become the
+    logarithm of the variance between two learned bounds per column (arXiv 1805.12114,
+    appendix A.1):
+
+    .. math::
+        \log \sigma^2 = \ell + \mathrm{softplus}(v' - \ell), \quad
+        v' = h - \mathrm{softplus}(h - v).
+
+    Far from the data they keep the variance within what was seen; :meth:`penalty` draws them
+    together. The upper bound is exceeded by less than :math:`e^{\ell - h}`.
+
+    The authors' training loss is twice the one here, without its constant: at the coefficient
+    0.01 that they write, theirs weighs what ``bound_penalty=0.005`` does here.
+
+    Args:
+        dim: columns of the target, n.
+        min_log_variance: the lower bounds at the start, normalised units.
+        max_log_variance: the upper bounds at the start.
+        bound_penalty: coefficient of the distance between the bounds.
+
+    Raises:
+        ValueError: for bounds in the wrong order, or a negative or infinite setting.
+
+    Examples:
+        >>> import torch
+        >>> head = GaussianHead(2)
+        >>> raw = torch.tensor([[0.3, -0.1, -3.0, 50.0]])
+        >>> head.log_variance(raw).detach()
+        tensor([[-3.0288,  0.5000]])
+        >>> head.standard_deviation(raw).detach()
+        tensor([[0.2199, 1.2840]])
+    """
+
+    def __init__(
+        self,
+        dim: int,
+        min_log_variance: float = -10.0,
+        max_log_variance: float = 0.5,
+        bound_penalty: float = 0.01,
+    ) -> None:
+        super().__init__()
+        if dim < 1:
+            raise ValueError(f"dim must be at least 1, got {dim}")
+        if not -math.inf < min_log_variance < max_log_variance < math.inf:
+            raise ValueError(
+                "min_log_variance must be below max_log_variance, and both finite, got "
+                f"{min_log_variance} and {max_log_variance}"
+            )
+        if not 0 <= bound_penalty < math.inf:
+            raise ValueError(f"bound_penalty must be finite and not negative, got {bound_penalty}")
+        self.dim = dim
+        self.bound_penalty = bound_penalty
+        self.min_log_variance = nn.Parameter(torch.full((dim,), float(min_log_variance)))
+        self.max_log_variance = nn.Parameter(torch.full((dim,), float(max_log_variance)))
+
+    def out_features(self, dim: int) -> int:
+        """Width of the raw output: twice that of the target.
+
+        Raises:
+            ValueError: if the head was made for another width.
+        """
+        if dim != self.dim:
+            raise ValueError(f"the head is for targets of width {self.dim}, the model's have {dim}")
+        return 2 * dim
+
+    def log_variance(self, raw: Tensor) -> Tensor:
+        """Bounded logarithm of the variance, ``(..., 2 dim)`` to ``(..., dim)``."""
+        below = self.max_log_variance - softplus(self.max_log_variance - raw[..., self.dim :])
+        return self.min_log_variance + softplus(below - self.min_log_variance)
+
+    def standard_deviation(self, raw: Tensor) -> Tensor:
+        """Predicted standard deviation, ``(..., 2 dim)`` to ``(..., dim)``."""
+        return (0.5 * self.log_variance(raw)).exp()
+
+    def loss(self, raw: Tensor, target: Tensor) -> Tensor:
+        """Negative log-likelihood in nats, averaged over the target's columns."""
+        log_variance = self.log_variance(raw)
+        squared = (target - raw[..., : self.dim]).square() * (-log_variance).exp()
+        return 0.5 * (squared + log_variance + math.log(2 * math.pi)).mean(-1)
+
+    def penalty(self) -> Tensor:
+        """``bound_penalty`` times the sum of the distances between upper and lower bounds."""
+        return self.bound_penalty * (self.max_log_variance.sum() - self.min_log_variance.sum())
+
+
+def make_head(name: str, dim: int) -> Head:
+    """The head that a recipe names, with its default settings.
+
+    Args:
+        name: ``"deterministic"`` or ``"gaussian"``.
+        dim: columns of the target.
+
+    Raises:
+        ValueError: for another name.
+
+    Examples:
+        >>> make_head("gaussian", 3).out_features(3)
+        6
+    """
+    if name not in HEADS:
+        raise ValueError(f"head must be {' or '.join(map(repr, HEADS))}, got {name!r}")
+    return GaussianHead(dim) if name == "gaussian" else DeterministicHead()

@@ -29,7 +29,8 @@ def imagine(
     action; what is stored is the policy's sample, whose likelihood the policy gradient needs.
 
     Args:
-        dynamics: the model; a member is drawn at each step (arXiv 1802.10592).
+        dynamics: the model; one of its elites is drawn at each step (arXiv 1802.10592), and its
+            mean taken.
         policy: maps observations ``(B, n)`` to sampled actions ``(B, m)``.
         reward: maps observation, clipped action and next observation to ``(B,)``.
         start: first observations ``(B, n)``.
@@ -46,7 +47,8 @@ def imagine(
         step that is ``done`` is not valid and means nothing.
     """
     batch, device = start.shape[0], start.device
-    members = torch.randint(dynamics.members, (horizon,)).tolist()
+    elites = dynamics.elites.tolist()
+    members = [elites[i] for i in torch.randint(len(elites), (horizon,)).tolist()]
     observations = start.new_empty(horizon + 1, batch, start.shape[-1])
     actions = start.new_empty(horizon, batch, action_low.shape[-1])
     rewards = start.new_empty(horizon, batch)

@@ -15,15 +15,18 @@ class EnsembleDynamicsLoss(LossModule):
     """Loss of every member of an :class:`EnsembleDynamics` on its own batch of transitions.
 
     The target is the normalised change of state; what is minimised per sample is the head's
-    business (mean squared error for the deterministic head, arXiv 2403.14860, section 3.1). The
-    members' losses are summed, so that each member's gradient is what it would be alone.
+    business: the mean squared error for a :class:`DeterministicHead` (arXiv 2403.14860,
+    section 3.1), the negative log-likelihood for a :class:`GaussianHead` (arXiv 1805.12114). The
+    members' losses are summed, so that each member's gradient is what it would be alone; the
+    head's penalty joins the sum once.
 
     Args:
         dynamics: the model to be trained.
 
     Input keys (see :meth:`set_keys`): ``observation``, ``action`` and ``next_observation`` with
     batch size ``[B]`` (all members see the same batch) or ``[E, B]`` (a batch per member).
-    Output: ``loss_dynamics`` (scalar) and ``member_loss`` ``(E,)``, detached.
+    Output: ``loss_dynamics`` (scalar), to be minimised, and ``member_loss`` ``(E,)``, detached and
+    without the penalty, so that it compares members and fits.
 
     Raises:
         KeyError: if an input key is missing.
@@ -79,6 +82,7 @@ class EnsembleDynamicsLoss(LossModule):
         inputs = model.normalize_inputs(observation, action)
         target = model.change_normalizer.normalize(next_observation - observation)
         per_member = model.head.loss(model.raw(inputs), target).mean(-1)
+        objective = per_member.sum() + model.head.penalty()
         return TensorDict(
-            {"loss_dynamics": per_member.sum(), "member_loss": per_member.detach()}, batch_size=[]
+            {"loss_dynamics": objective, "member_loss": per_member.detach()}, batch_size=[]
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -31,6 +32,10 @@ class EnsembleDynamics(nn.Module):
         head: meaning of a member's raw output and its loss; a :class:`DeterministicHead` if
             ``None``.
 
+    Attributes:
+        elites: indices of the members that the ensemble's mean is over, ascending, ``(k,)``; all
+            of them until :meth:`set_elites`.
+
     Examples:
         >>> import torch
         >>> model = EnsembleDynamics(4, 1, members=3, hidden=(16,))
@@ -38,6 +43,8 @@ class EnsembleDynamics(nn.Module):
         >>> change.shape, jacobian.shape
         (torch.Size([7, 4]), torch.Size([7, 4, 1]))
     """
+
+    elites: Tensor
 
     def __init__(
         self,
@@ -55,6 +62,7 @@ class EnsembleDynamics(nn.Module):
         self.action_dim = action_dim
         self.head: Head = DeterministicHead() if head is None else head
         self.network = self._make_network(hidden, members, activation)
+        self.register_buffer("elites", torch.arange(members))
         self.observation_normalizer = Normalizer(observation_dim, std_floor)
         self.action_normalizer = Normalizer(action_dim, std_floor)
         self.change_normalizer = Normalizer(observation_dim, std_floor)
@@ -68,8 +76,24 @@ class EnsembleDynamics(nn.Module):
 
     @property
     def members(self) -> int:
-        """Number of networks in the ensemble."""
+        """Number of networks in the ensemble, elites or not."""
         return self.network.members
+
+    def set_elites(self, index: Sequence[int] | Tensor) -> None:
+        """Say which members count in the ensemble's mean, and are drawn where one is drawn.
+
+        Args:
+            index: indices of the members, in any order.
+
+        Raises:
+            ValueError: if there is none, or one occurs twice or does not exist.
+        """
+        chosen = sorted(int(member) for member in index)
+        if not chosen or len(set(chosen)) < len(chosen):
+            raise ValueError(f"elites must be one member or more, each once, got {chosen}")
+        if chosen[0] < 0 or chosen[-1] >= self.members:
+            raise ValueError(f"elites must be in 0 to {self.members - 1}, got {chosen}")
+        self.elites = torch.tensor(chosen, device=self.elites.device)
 
     def fit_statistics(self, observation: Tensor, action: Tensor, change: Tensor) -> None:
         """Set the normalisers and the data box from samples ``(N, n)``, ``(N, m)``, ``(N, n)``."""
@@ -115,6 +139,24 @@ class EnsembleDynamics(nn.Module):
         changes = self.change_normalizer.denormalize(raw)
         return changes.reshape(self.members, *observation.shape)
 
+    def member_distribution(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """What every member predicts, elite or not, as independent normal distributions.
+
+        Args:
+            observation: ``(..., n)``, raw units.
+            action: ``(..., m)``, raw units.
+
+        Returns:
+            mean change and its standard deviation, both ``(E, ..., n)`` in raw units; the latter
+            is zero for a deterministic head.
+        """
+        inputs = self.normalize_inputs(observation, action)
+        raw = self.raw(inputs.reshape(-1, inputs.shape[-1]))
+        mean = self.change_normalizer.denormalize(raw[..., : self.observation_dim])
+        std = self.head.standard_deviation(raw) * self.change_normalizer.std
+        shape = (self.members, *observation.shape)
+        return mean.reshape(shape), std.reshape(shape)
+
     def member_change(self, observation: Tensor, action: Tensor, member: int) -> Tensor:
         """Predicted change of one member: ``(B, n)`` and ``(B, m)`` to ``(B, n)``."""
         inputs = self.normalize_inputs(observation, action)
@@ -122,8 +164,8 @@ class EnsembleDynamics(nn.Module):
         return self.change_normalizer.denormalize(raw)
 
     def mean_change(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Mean predicted change of the ensemble: ``(..., n)`` and ``(..., m)`` to ``(..., n)``."""
-        return self.member_changes(observation, action).mean(0)
+        """Mean predicted change of the elites: ``(..., n)`` and ``(..., m)`` to ``(..., n)``."""
+        return self._over_elites(self.member_changes(observation, action))
 
     forward = mean_change
 
@@ -142,8 +184,8 @@ class EnsembleDynamics(nn.Module):
         value, tangent = self.network.value_and_directional_derivatives(
             inputs.reshape(-1, n + m), n, n + m
         )
-        change = self.change_normalizer.denormalize(value.mean(0)[:, :n])
-        jacobian = tangent.mean(0)[..., :n].transpose(-2, -1)
+        change = self.change_normalizer.denormalize(self._over_elites(value)[:, :n])
+        jacobian = self._over_elites(tangent)[..., :n].transpose(-2, -1)
         scale = self.change_normalizer.std[:, None] / self.action_normalizer.std
         return (
             change.reshape(observation.shape),
@@ -169,5 +211,20 @@ class EnsembleDynamics(nn.Module):
         remainder = self.network.taylor_remainder(
             inputs.reshape(-1, width), step.reshape(-1, width)
         )
-        mean = remainder.mean(0)[:, : self.observation_dim] * self.change_normalizer.std
-        return mean.reshape(observation.shape)
+        mean = self._over_elites(remainder)[:, : self.observation_dim]
+        return (mean * self.change_normalizer.std).reshape(observation.shape)
+
+    def _over_elites(self, per_member: Tensor) -> Tensor:
+        """Mean of ``(E, ...)`` over the elites."""
+        if self.elites.shape[0] < self.members:
+            per_member = per_member[self.elites]
+        return per_member.mean(0)
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
+        # The number of elites is not that of the module, and older checkpoints have none.
+        stored = state_dict.setdefault(prefix + "elites", torch.arange(self.members))
+        if stored.shape != self.elites.shape:
+            self.elites = self.elites.new_empty(stored.shape)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

@@ -22,7 +22,7 @@ class EnsembleWorldModel(TensorDictModuleBase):
     Args:
         dynamics: the ensemble.
         reward: maps observation, action and next observation to ``(...)``.
-        propagation: ``"mean"`` of the ensemble, or a ``"random_member"`` per call.
+        propagation: ``"mean"`` of the ensemble, or a ``"random_member"`` of its elites per call.
     """
 
     in_keys = ["observation", "action"]  # noqa: RUF012
@@ -44,7 +44,8 @@ class EnsembleWorldModel(TensorDictModuleBase):
         if self.propagation == "mean":
             change = self.dynamics.mean_change(observation, action)
         else:
-            member = int(torch.randint(self.dynamics.members, ()))
+            elites = self.dynamics.elites.tolist()
+            member = elites[int(torch.randint(len(elites), ()))]
             change = self.dynamics.member_change(
                 observation.reshape(-1, observation.shape[-1]),
                 action.reshape(-1, action.shape[-1]),

@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+from copy import deepcopy
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchrl_l1.dynamics import EnsembleDynamics, EnsembleModelEnv, imagine, make_dynamics
+
+FORMS = ["nonlinear", "affine"]
+
+
+def make(
+    form: str = "nonlinear", members: int = 5, head: str = "deterministic"
+) -> EnsembleDynamics:
+    options = {"members": members, "hidden": (8, 6), "activation": "tanh", "head": head}
+    model = make_dynamics(3, 2, form, **options).double()
+    data = torch.randn(50, 8).double()
+    model.fit_statistics(data[:, :3], data[:, 3:5], data[:, 5:])
+    return model
+
+
+@pytest.mark.parametrize("form", FORMS)
+@given(chosen=st.sets(st.integers(0, 4), min_size=1), seed=st.integers(0, 1000))
+@settings(max_examples=20, deadline=None)
+def test_means_are_over_the_elites(form: str, chosen: set[int], seed: int) -> None:
+    torch.manual_seed(seed)
+    model = make(form, head="gaussian")
+    order = torch.tensor(sorted(chosen))[torch.randperm(len(chosen))]
+    model.set_elites(order)
+    assert model.elites.tolist() == sorted(chosen)
+    x, u, other = torch.randn(4, 3).double(), torch.randn(4, 2).double(), torch.randn(4, 2).double()
+
+    def mean(action: torch.Tensor) -> torch.Tensor:
+        return sum(model.member_change(x, action, member) for member in chosen) / len(chosen)
+
+    torch.testing.assert_close(model.mean_change(x, u), mean(u))
+    value, jacobian = model.value_and_jacobian(x, u)
+    torch.testing.assert_close(value, mean(u))
+    expected = torch.autograd.functional.jacobian(lambda a: mean(a).sum(0), u).permute(1, 0, 2)
+    torch.testing.assert_close(jacobian, expected)
+    tangent = value + (jacobian @ (other - u)[..., None])[..., 0]
+    torch.testing.assert_close(model.taylor_remainder(x, u, other), mean(other) - tangent)
+    assert model.member_changes(x, u).shape[0] == 5
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_all_as_elites_changes_no_bit(form: str) -> None:
+    torch.manual_seed(0)
+    model = make(form).float()
+    named = deepcopy(model)
+    named.set_elites([4, 2, 0, 1, 3])
+    x, u = torch.randn(20, 3), torch.randn(20, 2)
+    expected = model.member_changes(x, u).mean(0)
+    for one in (model, named):
+        assert torch.equal(one.mean_change(x, u), expected)
+        value, jacobian = one.value_and_jacobian(x, u)
+        assert torch.equal(value, model.value_and_jacobian(x, u)[0])
+        assert torch.equal(jacobian, model.value_and_jacobian(x, u)[1])
+
+
+@pytest.mark.parametrize(
+    ("chosen", "message"),
+    [([], "one member or more"), ([1, 1], "each once"), ([5], "0 to 4"), ([-1, 2], "0 to 4")],
+)
+def test_impossible_elites_are_named(chosen: list[int], message: str) -> None:
+    model = make()
+    with pytest.raises(ValueError, match=message):
+        model.set_elites(chosen)
+    assert model.elites.tolist() == [0, 1, 2, 3, 4]
+
+
+def test_elites_survive_a_checkpoint_and_older_ones_have_all() -> None:
+    torch.manual_seed(0)
+    model, other = make(), make()
+    model.set_elites([3, 1])
+    other.set_elites([0, 2, 4])
+    state = model.state_dict()
+    other.load_state_dict(state)
+    x, u = torch.randn(4, 3).double(), torch.randn(4, 2).double()
+    assert other.elites.tolist() == [1, 3]
+    assert torch.equal(other.mean_change(x, u), model.mean_change(x, u))
+    other.set_elites([0])
+    assert model.elites.tolist() == state["elites"].tolist() == [1, 3]
+    del state["elites"]
+    nested = torch.nn.ModuleDict({"inner": other})
+    nested.load_state_dict({f"inner.{name}": value for name, value in state.items()})
+    assert other.elites.tolist() == [0, 1, 2, 3, 4]
+    assert "elites" not in state
+
+
+@pytest.mark.parametrize("elites", [[0, 1, 2, 3, 4], [1, 3]])
+def test_imagination_draws_from_the_elites(elites: list[int]) -> None:
+    torch.manual_seed(0)
+    model = EnsembleDynamics(1, 1, members=5, hidden=())
+    with torch.no_grad():
+        model.network.weights[0].zero_()
+        model.network.biases[0][:, 0, 0] = torch.arange(5.0)  # each member adds its index
+    model.set_elites(elites)
+    model.box.fit(torch.tensor([[-1e3], [1e3]]))
+    bound = torch.ones(1)
+    start = torch.zeros(1, 1)
+    path = imagine(model, lambda x: x, lambda x, u, y: y[:, 0], start, 60, -bound, bound)
+    steps = path["next", "observation"] - path["observation"]
+    assert set(steps.flatten().int().tolist()) == set(elites)
+    env = EnsembleModelEnv(
+        model,
+        lambda x, u, y: y[..., 0],
+        lambda count: torch.zeros(count, 1),
+        -1.0,
+        1.0,
+        (1,),
+        "random_member",
+    )
+    path = env.rollout(60)
+    steps = path["next", "observation"] - path["observation"]
+    assert set(steps.flatten().int().tolist()) == set(elites)
