@@ -10,6 +10,7 @@ from typing import Any
 PACKAGES = (
     "control",
     "dynamics",
+    "planning",
     "envs",
     "objectives",
     "algorithms",

@@ -1,7 +1,8 @@
 """Robust model-based reinforcement learning with L1 adaptive control, for TorchRL.
 
 The names users compose are exported here; everything else lives in the sub-packages ``control``,
-``dynamics``, ``envs``, ``objectives``, ``algorithms``, ``experiment``, ``campaign`` and ``report``.
+``dynamics``, ``planning``, ``envs``, ``objectives``, ``algorithms``, ``experiment``, ``campaign`` and
+``report``.
 """
 
 from torchrl_l1._version import __version__
@@ -16,12 +17,14 @@ from torchrl_l1.control import (
 )
 from torchrl_l1.dynamics import EnsembleDynamics, EnsembleDynamicsLoss, EnsembleModelEnv
 from torchrl_l1.envs import BatchedMujocoEnv, make_env
+from torchrl_l1.planning import CEMConfig, ModelPredictiveController, TrajectorySampler
 
 __all__ = [
     "METRPO",
     "ActionJacobian",
     "Affinizer",
     "BatchedMujocoEnv",
+    "CEMConfig",
     "EnsembleDynamics",
     "EnsembleDynamicsLoss",
     "EnsembleModelEnv",
@@ -30,6 +33,8 @@ __all__ = [
     "L1State",
     "L1Transform",
     "METRPOConfig",
+    "ModelPredictiveController",
+    "TrajectorySampler",
     "__version__",
     "make_env",
 ]

@@ -1,0 +1,30 @@
+"""Planning in learned models: trajectory sampling, optimisers of action sequences, a policy."""
+
+from torchrl_l1.planning.cem import CEMConfig
+from torchrl_l1.planning.cem import plan as plan_cem
+from torchrl_l1.planning.mppi import MPPIConfig
+from torchrl_l1.planning.mppi import plan as plan_mppi
+from torchrl_l1.planning.network import PlanningNetwork, Precision, resolve_precision
+from torchrl_l1.planning.planner import ModelPredictiveController
+from torchrl_l1.planning.sequences import Evaluate, Plan
+from torchrl_l1.planning.shooting import ShootingConfig
+from torchrl_l1.planning.shooting import plan as plan_shooting
+from torchrl_l1.planning.trajectory_sampling import Propagation, TrajectorySampler, evaluate
+
+__all__ = [
+    "CEMConfig",
+    "Evaluate",
+    "MPPIConfig",
+    "ModelPredictiveController",
+    "Plan",
+    "PlanningNetwork",
+    "Precision",
+    "Propagation",
+    "ShootingConfig",
+    "TrajectorySampler",
+    "evaluate",
+    "plan_cem",
+    "plan_mppi",
+    "plan_shooting",
+    "resolve_precision",
+]

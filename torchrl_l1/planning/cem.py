@@ -1,0 +1,149 @@
+"""The cross-entropy method over bounded action sequences, batched over environments."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchrl_l1.planning.sequences import (
+    Evaluate,
+    Plan,
+    checked_bounds,
+    checked_mean,
+    evaluated,
+    initial_variance,
+    keep_best,
+    require,
+    sample_around,
+    select,
+)
+
+
+@dataclass
+class CEMConfig:
+    """Settings of the cross-entropy method; the defaults are those of arXiv 1805.12114.
+
+    Attributes:
+        horizon: actions in a sequence, H.
+        candidates: sequences drawn per iteration and environment, C.
+        elites: best sequences to which the distribution is fitted.
+        iterations: rounds of drawing and fitting, at most.
+        momentum: weight of the old mean and variance in the new ones. The more iterations there
+            are, the higher it may be: the variance shrinks more slowly, and less often before
+            the mean has arrived.
+        initial_variance: of the actions, action units squared; ``None`` for the square of a
+            quarter of each action's range.
+        minimum_variance: an environment whose variances are all at most this is done after an
+            iteration; 0 lets all iterations run.
+        return_best: execute the best sequence ever drawn instead of the final mean.
+    """
+
+    horizon: int = 25
+    candidates: int = 400
+    elites: int = 40
+    iterations: int = 5
+    momentum: float = 0.1
+    initial_variance: float | None = None
+    minimum_variance: float = 0.001
+    return_best: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse settings that could only fail later.
+
+        Raises:
+            ValueError: naming the setting.
+        """
+        require(
+            self,
+            horizon=(1, math.inf),
+            candidates=(1, math.inf),
+            elites=(1, math.inf),
+            iterations=(1, math.inf),
+            momentum=(0, 1),
+            minimum_variance=(0, math.inf),
+        )
+        if self.elites > self.candidates:
+            raise ValueError(
+                f"CEMConfig.elites ({self.elites}) must not exceed CEMConfig.candidates "
+                f"({self.candidates})"
+            )
+        if self.momentum == 1:
+            raise ValueError("CEMConfig.momentum must be below 1: at 1 nothing is ever learnt")
+        if self.initial_variance is not None and not 0 < self.initial_variance < math.inf:
+            raise ValueError(
+                "CEMConfig.initial_variance must be positive and finite, got "
+                f"{self.initial_variance}"
+            )
+
+
+@torch.no_grad()
+def plan(
+    evaluate: Evaluate,
+    mean: Tensor,
+    low: Tensor | float,
+    high: Tensor | float,
+    config: CEMConfig,
+    generator: torch.Generator | None = None,
+) -> Plan:
+    """Maximise returns over action sequences.
+
+    Sequences whose return is not finite are never elites; where all of an iteration are such,
+    mean and variance stay as they are.
+
+    Args:
+        evaluate: returns ``(N, C)`` of sequences ``(N, C, H, m)``.
+        mean: where to start ``(N, H, m)``, for example a previous plan, shifted.
+        low: lower bounds of the actions, ``(m,)`` or one number.
+        high: upper bounds.
+        config: the settings.
+        generator: source of randomness; torch's global one if ``None``.
+
+    Raises:
+        ValueError: for bounds that are empty, infinite or of the wrong width, a mean or returns
+            of the wrong shape.
+
+    Examples:
+        >>> target = torch.tensor([0.5, -0.25])
+        >>> result = plan(
+        ...     lambda u: -(u - target).square().sum((-2, -1)),
+        ...     mean=torch.zeros(1, 3, 2),
+        ...     low=-1.0,
+        ...     high=1.0,
+        ...     config=CEMConfig(horizon=3, iterations=20, minimum_variance=0.0),
+        ...     generator=torch.Generator().manual_seed(0),
+        ... )
+        >>> result.actions[0, 0].round(decimals=2)
+        tensor([ 0.5000, -0.2500])
+    """
+    low, high = checked_bounds(low, high, mean)
+    mean = torch.minimum(torch.maximum(checked_mean(mean, config.horizon), low), high)
+    variance = initial_variance(config.initial_variance, low, high, mean)
+    best, best_return = mean, torch.full_like(mean[:, 0, 0], -torch.inf)
+    unfinished = torch.ones_like(best_return, dtype=torch.bool)
+    for _ in range(config.iterations):
+        sequences = sample_around(mean, variance, low, high, config.candidates, generator)
+        returns = evaluated(evaluate, sequences)
+        best, best_return = keep_best(best, best_return, sequences, returns)
+        values, index = returns.topk(config.elites, dim=1)
+        finite = torch.isfinite(values)
+        fitted_mean, fitted_variance = _moments(select(sequences, index), finite)
+        update = (unfinished & finite.any(1))[:, None, None]
+        keep = config.momentum
+        mean = torch.where(update, keep * mean + (1 - keep) * fitted_mean, mean)
+        variance = torch.where(update, keep * variance + (1 - keep) * fitted_variance, variance)
+        unfinished = unfinished & (variance.amax((1, 2)) > config.minimum_variance)
+        if not unfinished.any():
+            break
+    actions = best if config.return_best else mean
+    return Plan(actions, mean, variance, best, best_return)
+
+
+def _moments(elites: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and variance ``(N, H, m)`` of the elites ``(N, K, H, m)`` that count ``(N, K)``."""
+    weight = counted.to(elites.dtype) / counted.sum(1, keepdim=True).clamp_min(1)
+    weight = weight[:, :, None, None]
+    mean = (weight * elites).sum(1)
+    return mean, (weight * (elites - mean.unsqueeze(1)).square()).sum(1)

@@ -1,0 +1,216 @@
+"""Model-predictive control as a policy: plan, act, shift the plan, plan again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Composite, Unbounded
+from torchrl.envs.transforms import TensorDictPrimer
+
+from torchrl_l1.planning import cem, mppi, shooting
+from torchrl_l1.planning.cem import CEMConfig
+from torchrl_l1.planning.mppi import MPPIConfig
+from torchrl_l1.planning.sequences import Plan, checked_bounds
+from torchrl_l1.planning.shooting import ShootingConfig
+from torchrl_l1.planning.trajectory_sampling import TrajectorySampler
+
+OptimizerConfig = CEMConfig | MPPIConfig | ShootingConfig
+
+PLAN_KEY = "plan"
+"""Default key of the nested tensordict that holds the planner's state."""
+
+_OPTIMIZERS: dict[type, Callable[..., Plan]] = {
+    CEMConfig: cem.plan,
+    MPPIConfig: mppi.plan,
+    ShootingConfig: shooting.plan,
+}
+
+
+class ModelPredictiveController(TensorDictModuleBase):
+    """Receding-horizon control with a learned model, as a policy (arXiv 1805.12114).
+
+    Reads the observation and the planner's state and writes the action and, under
+    ``("next", key)``, the next state: ``mean``, the plan without the actions already taken, from
+    which the next one starts, with the middle of the bounds at its end; ``step``, the number of
+    actions since the reset; and ``best_return``, what the last plan promised at best. The
+    environment needs the primer of :meth:`make_primer`, which starts the state at each reset and
+    carries it from step to step, for each environment on its own; an entry ``is_init``
+    (:class:`~torchrl.envs.InitTracker`), if there is one, restarts it as well.
+
+    The model is referred to, not registered: its weights are not among this module's
+    parameters, and updating them in place is seen by the next plan.
+
+    Args:
+        sampler: model, reward and how they are used.
+        config: the optimiser's settings; their type chooses it.
+        action_low: lower bounds of the actions, one number or one for each.
+        action_high: upper bounds.
+        replan_every: actions taken from a plan before the next, counted from each reset.
+        observation_key: key of the observation.
+        action_key: key of the action.
+        init_key: key of the flag of fresh resets.
+        key: name of the nested tensordict with the planner's state.
+        generator: source of randomness; torch's global one if ``None``.
+
+    Raises:
+        ValueError: for bounds that are empty or of the wrong width, ``replan_every`` outside the
+            horizon; at a call, for an observation or state of the wrong shape.
+        KeyError: at a call, if the observation or the planner's state is missing.
+        TypeError: for another kind of settings.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> from torchrl_l1.dynamics import EnsembleDynamics
+        >>> model = EnsembleDynamics(3, 1, hidden=(16,))
+        >>> upright = TrajectorySampler(model, lambda x, u, successor: successor[..., 0])
+        >>> config = CEMConfig(horizon=5, candidates=20, elites=4)
+        >>> policy = ModelPredictiveController(upright, config, -2.0, 2.0)
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), policy.make_primer())
+        >>> data = env.rollout(4, policy)
+        >>> data["action"].shape, data["plan", "mean"].shape
+        (torch.Size([4, 1]), torch.Size([4, 5, 1]))
+    """
+
+    def __init__(
+        self,
+        sampler: TrajectorySampler,
+        config: OptimizerConfig,
+        action_low: float | Sequence[float] | Tensor,
+        action_high: float | Sequence[float] | Tensor,
+        *,
+        replan_every: int = 1,
+        observation_key: NestedKey = "observation",
+        action_key: NestedKey = "action",
+        init_key: NestedKey = "is_init",
+        key: str = PLAN_KEY,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        if type(config) not in _OPTIMIZERS:
+            names = ", ".join(kind.__name__ for kind in _OPTIMIZERS)
+            raise TypeError(f"config must be one of {names}, got {type(config).__name__}")
+        if not 1 <= replan_every <= config.horizon:
+            raise ValueError(
+                f"replan_every must be between 1 and the horizon {config.horizon}, got "
+                f"{replan_every}"
+            )
+        self.sampler = sampler
+        self.config = config
+        self.replan_every = replan_every
+        self.observation_key = observation_key
+        self.action_key = action_key
+        self.init_key = init_key
+        self.key = key
+        self.generator = generator
+        zero = torch.zeros(1, config.horizon, sampler.dynamics.action_dim)
+        low, high = (
+            torch.as_tensor(bound, dtype=zero.dtype) for bound in (action_low, action_high)
+        )
+        self.action_low, self.action_high = checked_bounds(low, high, zero)
+        self._spec = {
+            "mean": (zero.shape[1:], torch.float32),
+            "step": (torch.Size([1]), torch.int64),
+            "best_return": (torch.Size([1]), torch.float32),
+        }
+        self.in_keys = [observation_key, init_key, (key, "mean"), (key, "step")]
+        self.in_keys.append((key, "best_return"))
+        self.out_keys = [action_key, *(("next", key, name) for name in self._spec)]
+
+    def make_primer(self) -> TensorDictPrimer:
+        """Transform that gives the environment the planner's state, fresh at every reset."""
+        spec = {name: Unbounded(shape, dtype=dtype) for name, (shape, dtype) in self._spec.items()}
+        return TensorDictPrimer(Composite({self.key: Composite(spec)}), expand_specs=True)
+
+    # The name under which torchrl.modules.utils.get_primers_from_module looks for it.
+    make_tensordict_primer = make_primer
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Act, and plan where it is time to, see the class."""
+        batch = tensordict.batch_size
+        observation = self._observation(tensordict)
+        count = batch.numel()
+        flat = observation.reshape(count, -1)
+        device = flat.device
+        mean, step, best_return = (
+            self._state(tensordict, name).to(device).reshape(count, *shape)
+            for name, (shape, _) in self._spec.items()
+        )
+        step = step[:, 0]
+        restarted = tensordict.get(self.init_key, None)
+        if restarted is not None:
+            step = torch.where(restarted.reshape(count).to(device), 0, step)
+        middle = ((self.action_low + self.action_high) / 2).to(device)
+        sequence = torch.where((step == 0)[:, None, None], middle, mean)
+        due = (step % self.replan_every == 0).nonzero()[:, 0]
+        if due.shape[0] > 0:
+            planned = _OPTIMIZERS[type(self.config)](
+                self.sampler.evaluator(flat[due], self.generator),
+                sequence[due],
+                self.action_low,
+                self.action_high,
+                self.config,
+                self.generator,
+            )
+            sequence = sequence.index_copy(0, due, planned.actions)
+            best_return = best_return.index_copy(0, due, planned.best_return[:, None])
+        following = {
+            "mean": torch.cat([sequence[:, 1:], middle.expand_as(sequence[:, :1])], 1),
+            "step": (step + 1)[:, None],
+            "best_return": best_return,
+        }
+        tensordict.set(self.action_key, sequence[:, 0].reshape(*batch, -1))
+        tensordict.set(
+            ("next", self.key),
+            TensorDict(
+                {
+                    name: value.reshape(*batch, *value.shape[1:])
+                    for name, value in following.items()
+                },
+                batch_size=batch,
+                device=tensordict.device,
+            ),
+        )
+        return tensordict
+
+    def _observation(self, tensordict: TensorDictBase) -> Tensor:
+        observation = tensordict.get(self.observation_key, None)
+        if observation is None:
+            found = sorted(map(str, tensordict.keys()))
+            raise KeyError(
+                f"ModelPredictiveController found no {self.observation_key!r} in the tensordict, "
+                f"only {found}"
+            )
+        expected = (*tensordict.batch_size, self.sampler.dynamics.observation_dim)
+        if tuple(observation.shape) != expected:
+            raise ValueError(
+                f"ModelPredictiveController: {self.observation_key!r} has shape "
+                f"{tuple(observation.shape)}, expected {expected} for its model"
+            )
+        if observation.dtype != torch.float32:
+            raise ValueError(
+                f"ModelPredictiveController: {self.observation_key!r} is {observation.dtype}, but "
+                "plans are float32: append DoubleToFloat() to the environment"
+            )
+        return observation
+
+    def _state(self, tensordict: TensorDictBase, name: str) -> Tensor:
+        value: Any = tensordict.get((self.key, name), None)
+        if value is None:
+            raise KeyError(
+                f"ModelPredictiveController found no {(self.key, name)!r}: append the primer to "
+                "the environment, TransformedEnv(env, controller.make_primer())"
+            )
+        expected = (*tensordict.batch_size, *self._spec[name][0])
+        if tuple(value.shape) != expected:
+            raise ValueError(
+                f"ModelPredictiveController: {(self.key, name)!r} has shape "
+                f"{tuple(value.shape)}, expected {expected}"
+            )
+        return value

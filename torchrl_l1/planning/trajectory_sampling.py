@@ -1,0 +1,286 @@
+"""Trajectory sampling: returns of action sequences, by particles through an ensemble."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import ceil
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.planning.network import PlanningNetwork, Precision, resolve_precision
+from torchrl_l1.planning.sequences import Evaluate
+
+Propagation = Literal["ts1", "tsinf", "mean"]
+RewardFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
+Termination = Callable[[Tensor], Tensor]
+
+# Trajectories per member whose activations, at a few hundred units, stay in the cores' caches for
+# the whole horizon together with that member's weights. Elsewhere it only bounds the memory.
+_CPU_BLOCK = 1600
+_OTHER_BLOCK = 131_072
+
+_Predict = Callable[[Tensor, int], Tensor]
+
+
+@torch.no_grad()
+def evaluate(
+    dynamics: EnsembleDynamics | PlanningNetwork,
+    observation: Tensor,
+    actions: Tensor,
+    reward: RewardFunction,
+    *,
+    particles: int = 20,
+    propagation: Propagation = "tsinf",
+    terminated: Termination | None = None,
+    precision: Precision = "float32",
+    block: int | None = None,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    r"""Mean over particles of the undiscounted sum of imagined rewards.
+
+    How a particle travels (arXiv 1805.12114, section 5):
+
+    - ``"tsinf"``: particle :math:`p` keeps elite :math:`p \bmod k` for the whole horizon, so
+      that any number of particles will do, but fewer than k leave elites out;
+    - ``"ts1"``: every particle draws an elite at every step;
+    - ``"mean"``: one particle, whatever ``particles``, moved by the mean of the elites' mean
+      changes.
+
+    With ``"tsinf"`` and ``"ts1"`` the change is sampled from the member's distribution if its
+    head has one. A particle earns the reward of the step that terminates it, and nothing after
+    it: where rewards are negative, shift them, or ending early pays. A particle with a state or
+    reward that is not finite, before it terminates, makes the return of its candidate minus
+    infinity.
+
+    Args:
+        dynamics: the model, or a snapshot of it, which is taken as it is.
+        observation: where the N environments are ``(N, n)``.
+        actions: candidate sequences ``(N, C, H, m)``; they are not clipped.
+        reward: maps observations ``(..., n)``, actions ``(..., m)`` and next observations to
+            ``(...)``; it sees whole trajectories at once.
+        particles: trajectories per candidate, P.
+        propagation: see above.
+        terminated: maps next observations ``(..., n)`` to booleans ``(...)``; never if ``None``.
+        precision: of the hidden layers, see :class:`PlanningNetwork`.
+        block: trajectories that go through the horizon together; ``None`` fits a processor's
+            cache, or takes them all on other devices.
+        generator: source of randomness; torch's global one if ``None``.
+
+    Returns:
+        returns ``(N, C)``, float32.
+
+    Raises:
+        ValueError: for shapes that do not fit the model, unknown propagation, or a reward or
+            termination of the wrong shape.
+
+    Examples:
+        >>> model = EnsembleDynamics(3, 1, members=5, hidden=(8,))
+        >>> evaluate(
+        ...     model,
+        ...     torch.zeros(2, 3),
+        ...     torch.zeros(2, 7, 4, 1),
+        ...     reward=lambda x, u, successor: -successor.square().sum(-1),
+        ...     particles=12,
+        ... ).shape
+        torch.Size([2, 7])
+    """
+    if propagation not in get_args(Propagation):
+        raise ValueError(f"propagation must be one of {get_args(Propagation)}, got {propagation!r}")
+    if particles < 1 or (block is not None and block < 1):
+        raise ValueError(f"particles and block must be positive, got {particles} and {block}")
+    if not isinstance(dynamics, PlanningNetwork):
+        dynamics = PlanningNetwork.from_dynamics(dynamics, precision)
+    network = dynamics
+    _check_shapes(network, observation, actions)
+    count, horizon = actions.shape[0] * actions.shape[1], actions.shape[2]
+    sequences = actions.float().reshape(count, horizon, network.action_dim)
+    start = observation.float()
+    total = torch.zeros(count, device=sequences.device)
+    if block is None:
+        block = _CPU_BLOCK if sequences.device.type == "cpu" else _OTHER_BLOCK
+        if propagation == "ts1":
+            block *= network.members
+    groups = _groups(network, particles, propagation)
+    # Member by member, so that only one member's weights compete for the cache with the block.
+    for member, share in groups:
+        blocks = ceil(count * share / block)
+        size = max(1, ceil(count / blocks))
+        for first in range(0, count, size):
+            plans = sequences[first : first + size]
+            owner = torch.arange(first, first + plans.shape[0], device=plans.device)
+            x = start[owner // actions.shape[1]].repeat_interleave(share, 0)
+            u = plans.transpose(0, 1).repeat_interleave(share, 1)
+            predict = _predictor(network, propagation, member, x.shape[0], horizon, generator)
+            returns = _rollout(network, predict, x, u, reward, terminated)
+            total[first : first + size] += returns.reshape(-1, share).sum(1)
+    mean = total / sum(share for _, share in groups)
+    return torch.where(torch.isfinite(mean), mean, -torch.inf).reshape(actions.shape[:2])
+
+
+@dataclass(frozen=True)
+class TrajectorySampler:
+    """The settings of :func:`evaluate` around a model, for planners.
+
+    The model is referred to: every plan copies its weights as they are then.
+
+    Attributes:
+        dynamics: the model.
+        reward: see :func:`evaluate`, as for all that follow.
+        terminated: the task's termination.
+        particles: trajectories per candidate.
+        propagation: ``"ts1"``, ``"tsinf"`` or ``"mean"``.
+        precision: ``"auto"``, ``"float32"`` or ``"bfloat16"``.
+        block: trajectories that go through the horizon together.
+
+    Raises:
+        ValueError: for an unknown propagation or precision, or no particles.
+    """
+
+    dynamics: EnsembleDynamics
+    reward: RewardFunction
+    terminated: Termination | None = None
+    particles: int = 20
+    propagation: Propagation = "tsinf"
+    precision: Precision = "auto"
+    block: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse settings that could only fail later."""
+        resolve_precision(self.precision)
+        if self.propagation not in get_args(Propagation):
+            raise ValueError(
+                f"propagation must be one of {get_args(Propagation)}, got {self.propagation!r}"
+            )
+        if self.particles < 1 or (self.block is not None and self.block < 1):
+            raise ValueError(
+                f"particles and block must be positive, got {self.particles} and {self.block}"
+            )
+
+    def evaluator(self, observation: Tensor, generator: torch.Generator | None = None) -> Evaluate:
+        """Returns ``(N, C)`` of sequences ``(N, C, H, m)`` from observations ``(N, n)``."""
+        network = PlanningNetwork.from_dynamics(self.dynamics, self.precision)
+
+        def returns(actions: Tensor) -> Tensor:
+            return evaluate(
+                network,
+                observation,
+                actions,
+                self.reward,
+                particles=self.particles,
+                propagation=self.propagation,
+                terminated=self.terminated,
+                block=self.block,
+                generator=generator,
+            )
+
+        return returns
+
+
+def _check_shapes(network: PlanningNetwork, observation: Tensor, actions: Tensor) -> None:
+    n, m = network.observation_dim, network.action_dim
+    if observation.dim() != 2 or observation.shape[1] != n:
+        raise ValueError(
+            f"observation must have shape (environments, {n}) for this model, got "
+            f"{tuple(observation.shape)}"
+        )
+    expected = f"({observation.shape[0]}, candidates, horizon, {m})"
+    if actions.dim() != 4 or actions.shape[0] != observation.shape[0] or actions.shape[3] != m:
+        raise ValueError(
+            f"actions must have shape {expected} for this model and observation, got "
+            f"{tuple(actions.shape)}"
+        )
+    if 0 in actions.shape:
+        raise ValueError(f"there is nothing to evaluate in actions of shape {tuple(actions.shape)}")
+
+
+def _groups(
+    network: PlanningNetwork, particles: int, propagation: Propagation
+) -> list[tuple[int, int]]:
+    """Pairs of a member and its number of particles; without meaning unless it is kept."""
+    if propagation == "mean":
+        return [(0, 1)]
+    if propagation == "ts1":
+        return [(0, particles)]
+    k = network.members
+    return [(member, len(range(member, particles, k))) for member in range(min(k, particles))]
+
+
+def _predictor(
+    network: PlanningNetwork,
+    propagation: Propagation,
+    member: int,
+    rows: int,
+    horizon: int,
+    generator: torch.Generator | None,
+) -> _Predict:
+    """Normalised change ``(rows, n)`` from raw inputs ``(rows, n + m)`` at a step."""
+    k = network.members
+    if propagation == "mean":
+
+        def mean(inputs: Tensor, step: int) -> Tensor:
+            change = network.change(inputs, 0).clone()
+            for other in range(1, k):
+                change += network.change(inputs, other)
+            return change.div_(k)
+
+        return mean
+    if propagation == "tsinf" or k == 1:
+        return lambda inputs, step: network.sampled_change(inputs, member, generator)
+    device = network.change_mean.device
+    drawn = torch.randint(k, (horizon, rows), generator=generator, device=device)
+    order = drawn.argsort(1)
+    sizes = torch.stack([(drawn == other).sum(1) for other in range(k)], 1).tolist()
+
+    def switching(inputs: Tensor, step: int) -> Tensor:
+        # Rows of the same member next to each other, one product for each.
+        parts = inputs[order[step]].split(sizes[step])
+        changes = [network.sampled_change(part, j, generator) for j, part in enumerate(parts)]
+        result = torch.empty_like(inputs[:, : network.observation_dim])
+        result[order[step]] = torch.cat(changes)
+        return result
+
+    return switching
+
+
+def _rollout(
+    network: PlanningNetwork,
+    predict: _Predict,
+    x: Tensor,
+    u: Tensor,
+    reward: RewardFunction,
+    terminated: Termination | None,
+) -> Tensor:
+    """Returns ``(B,)`` of trajectories from ``(B, n)`` under actions ``(H, B, m)``."""
+    horizon, n = u.shape[0], x.shape[1]
+    inputs = x.new_empty(horizon + 1, x.shape[0], n + u.shape[2])
+    states = inputs[..., :n]
+    states[0] = x
+    inputs[:-1, :, n:] = u
+    for t in range(horizon):
+        change = predict(inputs[t], t)
+        torch.addcmul(states[t], change, network.change_std, out=states[t + 1])
+        states[t + 1] += network.change_mean
+    rewards = _along(reward(states[:-1], u, states[1:]), u, "reward")
+    if terminated is None:
+        # A state that is not finite stays so: the last tells for all.
+        sound = torch.isfinite(states[-1]).all(-1)
+    else:
+        ended = _along(terminated(states[1:]), u, "terminated").long()
+        over = (ended.cumsum(0) - ended) > 0
+        rewards = torch.where(over, 0.0, rewards)
+        sound = (torch.isfinite(states[1:]).all(-1) | over).all(0)
+    returns = rewards.sum(0)
+    return torch.where(sound & torch.isfinite(returns), returns, -torch.inf)
+
+
+def _along(values: Tensor, u: Tensor, name: str) -> Tensor:
+    if values.shape != u.shape[:2]:
+        raise ValueError(
+            f"the {name} function must return shape (...) for inputs of shape (..., width), got "
+            f"{tuple(values.shape)} for inputs of shape {tuple(u.shape[:2])} + (width,)"
+        )
+    return values
