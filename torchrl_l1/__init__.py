@@ -1,8 +1,8 @@
 """Robust model-based reinforcement learning with L1 adaptive control, for TorchRL.
 
 The names users compose are exported here; everything else lives in the sub-packages ``control``,
-``dynamics``, ``planning``, ``envs``, ``objectives``, ``algorithms``, ``experiment``, ``campaign`` and
-``report``.
+``dynamics``, ``planning``, ``envs``, ``objectives``, ``algorithms``, ``experiment``, ``campaign``
+and ``report``.
 """
 
 from torchrl_l1._version import __version__
