@@ -59,7 +59,11 @@ def _bar(axis: Axes, x: float, row: Row, shade: str) -> None:
 
 
 def plot_disturbances(rows: Sequence[Row], heading: str, file: Path) -> Path | None:
-    """Return against actuator bias and against actuator gain, with 95 % intervals of the mean.
+    """Return against actuator bias and against actuator gain, and what L1 adds to it.
+
+    The band of a return is the 95 % interval of the mean over training seeds. These differ more
+    from each other than L1 off from L1 on, so below each return stands the difference, policy by
+    policy, with the interval of its own mean.
 
     Args:
         rows: of one training cell, tested under several biases and gains.
@@ -69,7 +73,7 @@ def plot_disturbances(rows: Sequence[Row], heading: str, file: Path) -> Path | N
     Returns:
         the file, or ``None`` if neither bias nor gain varies.
     """
-    panels = []
+    found: list[tuple[str, str, list[Row]]] = []
     for policy, noise in dict.fromkeys((row["policy"], row["noise"]) for row in rows):
         for what, other, neutral in (("bias", "gain", 1.0), ("gain", "bias", 0.0)):
             chosen = [
@@ -78,15 +82,28 @@ def plot_disturbances(rows: Sequence[Row], heading: str, file: Path) -> Path | N
                 if (row["policy"], row["noise"], row[other]) == (policy, noise, neutral)
             ]
             if len({row[what] for row in chosen}) > 1:
-                panels.append((_panel_title(policy, noise), what, chosen))
-    if not panels:
+                found.append((_panel_title(policy, noise), what, chosen))
+    if not found:
         return None
-    figure, axes = grid(len(panels), columns=2, width=5.2, height=3.7)
+    # All panels of a column vary the same; returns and differences take turns down the rows.
+    columns = len({what for _, what, _ in found})
+    groups = [found[i : i + columns] for i in range(0, len(found), columns)]
+    panels = [
+        (name, what, chosen, value)
+        for group in groups
+        for value in ("return", "difference")
+        for name, what, chosen in group
+        if any(f"{value}_mean" in row for row in chosen)
+    ]
+    figure, axes = grid(len(panels), columns=columns, width=5.2, height=3.2)
     shown: list[Sequence[float]] = []
-    for axis, (name, what, chosen) in zip(axes, panels, strict=True):
-        shown += _draw_disturbance(axis, what, chosen)
+    for axis, (name, what, chosen, value) in zip(axes, panels, strict=True):
+        drawn = _draw_disturbance(axis, what, chosen, value)
         axis.set_title(name, fontsize=10)
-    fit_scale(axes, shown)
+        if value == "return":
+            shown += drawn
+    returns = [axis for axis, panel in zip(axes, panels, strict=True) if panel[-1] == "return"]
+    fit_scale(returns, shown)
     figure.suptitle(heading, fontsize=11)
     legend_below(figure, axes)
     return save(figure, file)
@@ -98,25 +115,37 @@ def _panel_title(policy: str, noise: str) -> str:
     return name if noise == "none" else f"{name}, noise: {noise}"
 
 
-def _draw_disturbance(axis: Axes, what: str, rows: Sequence[Row]) -> list[Sequence[float]]:
-    """Draw a panel; returns the values in it."""
+def _draw_disturbance(
+    axis: Axes, what: str, rows: Sequence[Row], value: str
+) -> list[Sequence[float]]:
+    """Draw a panel of returns or differences; returns its values and lower limits."""
     shown: list[Sequence[float]] = []
     for index, tested in enumerate(dict.fromkeys(row["l1"] for row in rows)):
-        line = sorted((row for row in rows if row["l1"] == tested), key=lambda row: row[what])
-        x = [row[what] for row in line]
+        mine = [row for row in rows if row["l1"] == tested and f"{value}_mean" in row]
+        if not mine:
+            continue
+        line = sorted(mine, key=lambda row: row[what])
         shade = color(3 + index, tested)
-        means = [row["return_mean"] for row in line]
-        axis.plot(x, means, "o-", color=shade, markersize=4, label=arm_label(tested))
+        means = [row[f"{value}_mean"] for row in line]
+        axis.plot(
+            [row[what] for row in line], means, "o-", color=shade, markersize=4,
+            label=arm_label(tested),
+        )  # fmt: skip
         shown.append(means)
-        limits = [row for row in line if row.get("return_low") is not None]
+        limits = [row for row in line if row.get(f"{value}_low") is not None]
         if limits:
-            low, high = ([row[f"return_{side}"] for row in limits] for side in ("low", "high"))
+            low, high = ([row[f"{value}_{side}"] for row in limits] for side in ("low", "high"))
             axis.fill_between(
                 [row[what] for row in limits], low, high, color=shade, alpha=0.18, linewidth=0
             )
-            shown += [low, high]
+            # Not the upper limit: it may lie beyond what a return can be.
+            shown.append(low)
     axis.set_xlabel(f"actuator {what} ({'action units' if what == 'bias' else 'factor'})")
-    axis.set_ylabel("return (sum of rewards)")
+    if value == "return":
+        axis.set_ylabel("return (sum of rewards)")
+    else:
+        axis.set_ylabel("return, less that with L1 off")
+        axis.axhline(0, color="black", linewidth=0.8)
     axis.grid(alpha=0.3)
     return shown
 

@@ -75,7 +75,8 @@ def _disturbances(page: Page, rows: Sequence[Row]) -> None:
     page.heading(
         "Disturbances",
         "Return of frozen policies against an actuator bias and an actuator gain that the model "
-        "has never seen: mean over training seeds, with its 95 % interval as a band.",
+        "has never seen: mean over training seeds, with its 95 % interval as a band; below it, the "
+        "difference to the same policies without L1 with the interval of its mean.",
     )
     for heading, words, chosen in _training_cells(rows):
         file = page.folder / f"disturbances_{slug(words)}.png"
