@@ -1,4 +1,4 @@
-"""The processes that a campaign starts: to train, to evaluate, or ``torchrl-l1`` for a sweep.
+"""The processes that a campaign starts: to train, to evaluate, or to launch a sweep.
 
 Not for users: they end when the campaign's own process, PARENT, ends, however it does.
 """
@@ -42,9 +42,10 @@ def main(arguments: Sequence[str]) -> None:
         for name, settings in json.loads(evaluations).items():
             print(f"Evaluated: {evaluate_run(run_dir, name, settings)}", flush=True)
     else:
-        from torchrl_l1.cli import main as command_line
+        from torchrl_l1.experiment.launch import launch
 
-        command_line([command, *rest])
+        recipe, *overrides = rest
+        launch(recipe, overrides)
 
 
 def train(settings: Mapping[str, Any]) -> None:
