@@ -52,7 +52,7 @@ def test_without_l1_there_are_no_l1_metrics() -> None:
 def test_buffer_holds_the_policy_action_and_the_executed_one() -> None:
     algorithm = make()
     list(algorithm.iterate())
-    data = algorithm.buffer[:]
+    data = algorithm.learning.buffer[:]
     assert data.shape == (225,)
     assert data["action"].abs().max() <= 3
     random, learned = data[:75], data[75:]
@@ -64,7 +64,7 @@ def test_buffer_holds_the_policy_action_and_the_executed_one() -> None:
 def test_actions_can_be_left_unclipped_without_l1_only() -> None:
     algorithm = make(l1=None, clip_actions=False, policy=PolicyConfig(hidden=[8], std=4.0))
     list(algorithm.iterate())
-    learned = algorithm.buffer[:][75:]
+    learned = algorithm.learning.buffer[:][75:]
     assert learned["action"].abs().max() > 3
     assert torch.equal(learned["action"], learned["executed"])
     with pytest.raises(ValueError, match="l1=off"):
@@ -110,9 +110,9 @@ def test_label_decides_what_the_model_is_fitted_to() -> None:
 
 def test_imagined_trajectories_start_where_the_configuration_says() -> None:
     algorithm = make(imagined_from_data=0.25)
-    algorithm.store(algorithm.collection.random(0))
-    starts = algorithm.improvement.starts(40, algorithm.buffer)
-    stored = algorithm.buffer[:]["observation"]
+    algorithm.learning.store(algorithm.collection.random(0))
+    starts = algorithm.improvement.starts(40, algorithm.learning.buffer)
+    stored = algorithm.learning.buffer[:]["observation"]
     from_data = (starts[:, None] == stored).all(-1).any(-1)
     assert from_data.tolist() == [False] * 30 + [True] * 10
     # The others are the pendulum's resets: within 0.01 of upright rest.

@@ -16,9 +16,7 @@ from itertools import pairwise
 from time import perf_counter
 from typing import Any
 
-import torch
-from tensordict import TensorDict, TensorDictBase
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from tensordict import TensorDictBase
 
 from torchrl_l1.algorithms.collection import (
     Collection,
@@ -30,12 +28,13 @@ from torchrl_l1.algorithms.collection import (
 from torchrl_l1.algorithms.device import resolve_device
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig, check_clipping
 from torchrl_l1.algorithms.metrpo_metrics import fit_metrics, policy_metrics
+from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.policy import GaussianPolicy, acting
 from torchrl_l1.algorithms.policy_improvement import PolicyImprovement
 from torchrl_l1.algorithms.seeding import seed_streams
 from torchrl_l1.control import L1Config
 from torchrl_l1.control.compilation import CompileMode
-from torchrl_l1.dynamics import fit_ensemble, make_dynamics
+from torchrl_l1.dynamics import make_dynamics
 from torchrl_l1.envs import get_task
 
 
@@ -91,9 +90,6 @@ class METRPO:
         self.dynamics = make_dynamics(n, m, **vars(config.model)).to(self.device)
         self.policy = GaussianPolicy(n, m, config.policy.hidden, config.policy.std).to(self.device)
         self.improvement = PolicyImprovement(self.task, self.dynamics, self.policy, config)
-        self.optimizer = torch.optim.Adam(
-            self.dynamics.parameters(), lr=config.fit.learning_rate, fused=True
-        )
         on_cpu = self.device.type == "cpu"
         self.acting_policy = self.policy if on_cpu else deepcopy(self.policy).cpu()
         self.acting_dynamics = self.dynamics if on_cpu else deepcopy(self.dynamics).cpu()
@@ -111,11 +107,8 @@ class METRPO:
             episodes=config.episodes_per_iteration, horizon=min(config.episode_steps or full, full)
         )
         self.evaluation = real(episodes=config.evaluation_episodes, horizon=full)
-        frames = self.collection.frames
-        self.buffer = ReplayBuffer(
-            storage=LazyTensorStorage((config.outer_iterations + 1) * frames),
-            batch_size=config.fit.batch_size,
-        )
+        capacity = (config.outer_iterations + 1) * self.collection.frames
+        self.learning = ModelLearning(self.dynamics, config.fit, config.label, capacity)
         self.iteration = 0
 
     def iterate(self) -> Iterator[IterationResult]:
@@ -124,36 +117,29 @@ class METRPO:
         while self.iteration < config.outer_iterations:
             seed_streams(self.seed, "iteration", self.iteration)
             clock = [perf_counter()]
-            if len(self.buffer) == 0:
+            if len(self.learning.buffer) == 0:
                 self.on_phase("random data")
-                self.store(self.collection.random(self.seed))
+                self.learning.store(self.collection.random(self.seed))
             clock.append(perf_counter())
 
-            fit = fit_ensemble(
-                self.dynamics,
-                self.buffer,
-                config.fit,
-                self.optimizer,
-                action_key="action" if config.label == "nominal" else "executed",
-                on_epoch=lambda epoch: self.on_phase(f"fit, epoch {epoch}"),
-            )
+            fit = self.learning.fit(lambda epoch: self.on_phase(f"fit, epoch {epoch}"))
             clock.append(perf_counter())
 
             if config.policy.normalize:
-                self.policy.normalizer.fit(self.buffer[:]["observation"])
+                self.policy.normalizer.fit(self.learning.buffer[:]["observation"])
             if config.policy.reset_std:
                 self.policy.reset_std(config.policy.std)
             steps = []
             for step in range(config.trpo_iterations):
                 self.on_phase(f"TRPO {step + 1}/{config.trpo_iterations}")
-                steps.append(self.improvement.step(self.buffer))
+                steps.append(self.improvement.step(self.learning.buffer))
             clock.append(perf_counter())
 
             self.on_phase("collecting")
             self.acting_policy.load_state_dict(self.policy.state_dict())
             self.acting_dynamics.load_state_dict(self.dynamics.state_dict())
             data = self.collection.collect(self.seed, self.iteration)
-            self.store(data)
+            self.learning.store(data)
             clock.append(perf_counter())
             self.on_phase("evaluating")
             returns = self.evaluate(data)
@@ -172,16 +158,6 @@ class METRPO:
             phases = ("random", "fit", "trpo", "collect", "evaluate")
             seconds = [after - before for before, after in pairwise(clock)]
             yield IterationResult(metrics, dict(zip(phases, seconds, strict=True)))
-
-    def store(self, data: TensorDictBase) -> None:
-        """Add real transitions ``[N, T]``, a fixed share of them marked for validation."""
-        flat = data.reshape(-1)
-        flat = flat[~flat["next", "non_finite"].squeeze(-1)]
-        items = flat.select(
-            "observation", "action", "executed", ("next", "observation"), ("next", "reward")
-        )
-        items["validation"] = torch.rand(items.shape[0]) < self.config.fit.validation_fraction
-        self.buffer.extend(items)
 
     def evaluate(self, data: TensorDictBase) -> dict[str, float]:
         """Returns of full episodes: with sampled actions and with the policy's mean action.
@@ -202,20 +178,14 @@ class METRPO:
         """Everything needed to continue, as plain tensors and numbers."""
         return {
             "iteration": self.iteration,
-            "dynamics": self.dynamics.state_dict(),
             "policy": self.policy.state_dict(),
             "improvement": self.improvement.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "buffer": self.buffer[:].to_dict() if len(self.buffer) else {},
+            **self.learning.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
         self.iteration = state["iteration"]
-        self.dynamics.load_state_dict(state["dynamics"])
         self.policy.load_state_dict(state["policy"])
         self.improvement.load_state_dict(state["improvement"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.buffer.empty()
-        if state["buffer"]:
-            self.buffer.extend(TensorDict(state["buffer"]).auto_batch_size_(1))
+        self.learning.load_state_dict(state)

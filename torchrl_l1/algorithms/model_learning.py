@@ -1,0 +1,73 @@
+"""What every algorithm around a learned model keeps: the model, its optimizer and its data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+
+from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, FitReport, fit_ensemble
+
+
+class ModelLearning:
+    """A model, the real transitions seen so far, and the fits of one to the other.
+
+    Args:
+        dynamics: the model; changed in place by :meth:`fit`.
+        config: how it is fitted.
+        label: ``nominal`` fits it to the policy's action, ``executed`` to what L1 sent to the
+            actuators.
+        capacity: real transitions that there is room for.
+    """
+
+    def __init__(
+        self, dynamics: EnsembleDynamics, config: FitConfig, label: str, capacity: int
+    ) -> None:
+        self.dynamics, self.config = dynamics, config
+        self.action_key = "action" if label == "nominal" else "executed"
+        self.optimizer = torch.optim.Adam(
+            dynamics.parameters(), lr=config.learning_rate, fused=True
+        )
+        self.buffer = ReplayBuffer(
+            storage=LazyTensorStorage(capacity), batch_size=config.batch_size
+        )
+
+    def store(self, data: TensorDictBase) -> None:
+        """Add real transitions ``[N, T]``, a fixed share of them marked for validation."""
+        flat = data.reshape(-1)
+        flat = flat[~flat["next", "non_finite"].squeeze(-1)]
+        items = flat.select(
+            "observation", "action", "executed", ("next", "observation"), ("next", "reward")
+        )
+        items["validation"] = torch.rand(items.shape[0]) < self.config.validation_fraction
+        self.buffer.extend(items)
+
+    def fit(self, on_epoch: Callable[[int], None] | None = None) -> FitReport:
+        """Fit the model to all data, from the weights that it has."""
+        return fit_ensemble(
+            self.dynamics,
+            self.buffer,
+            self.config,
+            self.optimizer,
+            action_key=self.action_key,
+            on_epoch=on_epoch,
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to continue, as plain tensors and numbers."""
+        return {
+            "dynamics": self.dynamics.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "buffer": self.buffer[:].to_dict() if len(self.buffer) else {},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from :meth:`state_dict`; other entries of ``state`` do not matter."""
+        self.dynamics.load_state_dict(state["dynamics"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.buffer.empty()
+        if state["buffer"]:
+            self.buffer.extend(TensorDict(state["buffer"]).auto_batch_size_(1))
