@@ -3,5 +3,15 @@
 from torchrl_l1.algorithms.collection import Perturbation
 from torchrl_l1.algorithms.metrpo import METRPO
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig, ModelConfig, PolicyConfig
+from torchrl_l1.algorithms.pets import PETS
+from torchrl_l1.algorithms.pets_config import PETSConfig
 
-__all__ = ["METRPO", "METRPOConfig", "ModelConfig", "Perturbation", "PolicyConfig"]
+__all__ = [
+    "METRPO",
+    "PETS",
+    "METRPOConfig",
+    "ModelConfig",
+    "PETSConfig",
+    "Perturbation",
+    "PolicyConfig",
+]

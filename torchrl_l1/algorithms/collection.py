@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase, RewardSum, TransformedEnv
+from torchrl.envs import EnvBase, RewardSum, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_type
 
 from torchrl_l1.algorithms.seeding import seed_streams, stream_seed
@@ -66,13 +66,14 @@ def make_pipeline(
     l1: L1Config | None,
     horizon: int | None = None,
     compile_l1: CompileMode = False,
+    extra: Sequence[Transform] = (),
 ) -> TransformedEnv:
-    """The perturbed environment, augmented by L1 unless ``l1`` is ``None``.
+    """The perturbed environment, augmented by L1 unless ``l1`` is ``None``, and ``extra``.
 
     The order matters: on its way in, an action meets L1 first and the noise last; on its way
     out, an observation is noisy before L1 sees it.
     """
-    extra = [] if l1 is None else [L1Transform(dynamics, l1, compile=compile_l1)]
+    controller = [] if l1 is None else [L1Transform(dynamics, l1, compile=compile_l1)]
     return make_env(
         task,
         num_envs,
@@ -81,7 +82,7 @@ def make_pipeline(
         actuator_bias=perturbation.actuator_bias,
         actuator_gain=perturbation.actuator_gain,
         max_steps=horizon,
-        extra_transforms=[RewardSum(), *extra],
+        extra_transforms=[RewardSum(), *controller, *extra],
     )
 
 
@@ -106,7 +107,12 @@ class Collection:
         self.horizon = horizon or task.horizon
         self.frames = episodes * self.horizon
         self.policy = policy
-        self.env = make_pipeline(task, episodes, perturbation, dynamics, l1, horizon, compile_l1)
+        # A policy with a memory brings the transform that keeps it.
+        primer = getattr(policy, "make_tensordict_primer", None)
+        extra = [] if primer is None else [primer()]
+        self.env = make_pipeline(
+            task, episodes, perturbation, dynamics, l1, horizon, compile_l1, extra
+        )
         # Random data never pass through L1: there is no model yet.
         self._bare_env = partial(
             make_pipeline, task, episodes, perturbation, dynamics, None, horizon

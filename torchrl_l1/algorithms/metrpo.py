@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from copy import deepcopy
-from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from time import perf_counter
@@ -26,6 +25,7 @@ from torchrl_l1.algorithms.collection import (
     signal_metrics,
 )
 from torchrl_l1.algorithms.device import resolve_device
+from torchrl_l1.algorithms.iteration import IterationResult
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig, check_clipping
 from torchrl_l1.algorithms.metrpo_metrics import fit_metrics, policy_metrics
 from torchrl_l1.algorithms.model_learning import ModelLearning
@@ -36,14 +36,6 @@ from torchrl_l1.control import L1Config
 from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.dynamics import make_dynamics
 from torchrl_l1.envs import get_task
-
-
-@dataclass
-class IterationResult:
-    """What an outer iteration reports: metrics, and wall-clock seconds by phase."""
-
-    metrics: dict[str, float]
-    seconds: dict[str, float]
 
 
 class METRPO:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import get_args
 
-from torchrl_l1.dynamics import MODEL_FORMS, FitConfig
+from torchrl_l1.dynamics import HEADS, MODEL_FORMS, FitConfig
 from torchrl_l1.dynamics.ensemble import ActivationName
 from torchrl_l1.objectives import TRPOConfig
 
@@ -18,6 +18,7 @@ class ModelConfig:
 
     Attributes:
         form: ``nonlinear``, or ``affine`` in the action.
+        head: what a member predicts: ``deterministic``, a point, or ``gaussian``, a distribution.
         members: number of networks.
         hidden: widths of a nonlinear network's hidden layers; for the control-affine form they
             are scaled to the same number of parameters.
@@ -28,6 +29,7 @@ class ModelConfig:
     """
 
     form: str = "nonlinear"
+    head: str = "deterministic"
     members: int = 5
     hidden: list[int] = field(default_factory=lambda: [256, 256])
     activation: str = "relu"
@@ -41,6 +43,7 @@ class ModelConfig:
             ValueError: naming the setting.
         """
         _check_choice("model.form", self.form, MODEL_FORMS)
+        _check_choice("model.head", self.head, HEADS)
         _check_choice("model.activation", self.activation, get_args(ActivationName))
         if self.members < 1:
             raise ValueError(f"model.members must be at least 1, got {self.members}")

@@ -83,6 +83,11 @@ class Task:
         return self.reward_in_imagination or self.reward
 
     @property
+    def terminates(self) -> bool:
+        """Whether any state ends an episode."""
+        return self.terminated is not never
+
+    @property
     def dt(self) -> float:
         """Duration of one environment step in seconds."""
         return self.timestep * self.frame_skip

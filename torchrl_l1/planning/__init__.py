@@ -9,7 +9,12 @@ from torchrl_l1.planning.planner import ModelPredictiveController
 from torchrl_l1.planning.sequences import Evaluate, Plan
 from torchrl_l1.planning.shooting import ShootingConfig
 from torchrl_l1.planning.shooting import plan as plan_shooting
-from torchrl_l1.planning.trajectory_sampling import Propagation, TrajectorySampler, evaluate
+from torchrl_l1.planning.trajectory_sampling import (
+    Propagation,
+    TrajectorySampler,
+    check_sampling,
+    evaluate,
+)
 
 __all__ = [
     "CEMConfig",
@@ -22,6 +27,7 @@ __all__ = [
     "Propagation",
     "ShootingConfig",
     "TrajectorySampler",
+    "check_sampling",
     "evaluate",
     "plan_cem",
     "plan_mppi",

@@ -22,15 +22,17 @@ _ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 def resolve_precision(
-    precision: Precision, device: torch.device | str = "cpu"
+    precision: str, device: torch.device | str = "cpu"
 ) -> Literal["float32", "bfloat16"]:
     """``"auto"`` becomes ``"bfloat16"`` on processors that multiply it natively.
 
     Raises:
         ValueError: for an unknown precision.
     """
-    if precision == "float32" or precision == "bfloat16":
-        return precision
+    if precision == "float32":
+        return "float32"
+    if precision == "bfloat16":
+        return "bfloat16"
     if precision != "auto":
         raise ValueError(f"precision must be 'auto', 'float32' or 'bfloat16', got {precision!r}")
     if torch.device(device).type != "cpu":

@@ -88,10 +88,7 @@ def evaluate(
         ... ).shape
         torch.Size([2, 7])
     """
-    if propagation not in get_args(Propagation):
-        raise ValueError(f"propagation must be one of {get_args(Propagation)}, got {propagation!r}")
-    if particles < 1 or (block is not None and block < 1):
-        raise ValueError(f"particles and block must be positive, got {particles} and {block}")
+    check_sampling(particles, propagation, precision, block)
     if not isinstance(dynamics, PlanningNetwork):
         dynamics = PlanningNetwork.from_dynamics(dynamics, precision)
     network = dynamics
@@ -150,15 +147,7 @@ class TrajectorySampler:
 
     def __post_init__(self) -> None:
         """Refuse settings that could only fail later."""
-        resolve_precision(self.precision)
-        if self.propagation not in get_args(Propagation):
-            raise ValueError(
-                f"propagation must be one of {get_args(Propagation)}, got {self.propagation!r}"
-            )
-        if self.particles < 1 or (self.block is not None and self.block < 1):
-            raise ValueError(
-                f"particles and block must be positive, got {self.particles} and {self.block}"
-            )
+        check_sampling(self.particles, self.propagation, self.precision, self.block)
 
     def evaluator(self, observation: Tensor, generator: torch.Generator | None = None) -> Evaluate:
         """Returns ``(N, C)`` of sequences ``(N, C, H, m)`` from observations ``(N, n)``."""
@@ -178,6 +167,21 @@ class TrajectorySampler:
             )
 
         return returns
+
+
+def check_sampling(
+    particles: int, propagation: str, precision: str = "float32", block: int | None = None
+) -> None:
+    """Refuse settings of :func:`evaluate` that make no sense.
+
+    Raises:
+        ValueError: naming the setting.
+    """
+    resolve_precision(precision)
+    if propagation not in get_args(Propagation):
+        raise ValueError(f"propagation must be one of {get_args(Propagation)}, got {propagation!r}")
+    if particles < 1 or (block is not None and block < 1):
+        raise ValueError(f"particles and block must be positive, got {particles} and {block}")
 
 
 def _check_shapes(network: PlanningNetwork, observation: Tensor, actions: Tensor) -> None:

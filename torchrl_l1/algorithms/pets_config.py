@@ -1,0 +1,77 @@
+"""Settings of PETS and DETS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from torchrl_l1.algorithms.metrpo_config import ModelConfig
+from torchrl_l1.dynamics import FitConfig
+from torchrl_l1.planning import CEMConfig, check_sampling
+
+
+@dataclass
+class PETSConfig:
+    """Settings of :class:`~torchrl_l1.algorithms.PETS`.
+
+    With a Gaussian head and sampled trajectories the algorithm is PETS (arXiv 1805.12114); with a
+    deterministic one it is DETS, as arXiv 2403.14860 has it beside L1.
+
+    Attributes:
+        outer_iterations: rounds of fit and collection.
+        episodes_per_iteration: real episodes per round (and of random data before the first),
+            run side by side.
+        episode_steps: steps of a collected episode; the task's horizon if null. Returns are then
+            measured on full episodes that do not join the data.
+        evaluation_episodes: full episodes beside the data after each round; none by default,
+            since they are as dear as those that join it.
+        fit_every: rounds from one fit of the model to the next.
+        replan_every: actions taken from a plan before the next.
+        particles: imagined trajectories per candidate sequence.
+        propagation: how they travel through the ensemble: ``tsinf``, ``ts1`` or ``mean``, see
+            :func:`~torchrl_l1.planning.evaluate`.
+        precision: of the hidden layers in planning: ``float32``, ``bfloat16``, or ``auto`` for
+            what the processor multiplies fastest.
+        label: action that the model is fitted to: ``nominal`` is the planner's, ``executed`` what
+            L1 sends to the actuators.
+        cem: see :class:`~torchrl_l1.planning.CEMConfig`.
+        model: see :class:`ModelConfig`.
+        fit: see :class:`~torchrl_l1.dynamics.FitConfig`.
+    """
+
+    outer_iterations: int = 20
+    episodes_per_iteration: int = 1
+    episode_steps: int | None = None
+    evaluation_episodes: int = 0
+    fit_every: int = 1
+    replan_every: int = 1
+    particles: int = 20
+    propagation: str = "tsinf"
+    precision: str = "auto"
+    label: str = "executed"
+    cem: CEMConfig = field(default_factory=CEMConfig)
+    model: ModelConfig = field(default_factory=lambda: ModelConfig(head="gaussian"))
+    fit: FitConfig = field(default_factory=FitConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse settings that could only fail later.
+
+        Raises:
+            ValueError: naming the setting.
+        """
+        if self.label not in ("nominal", "executed"):
+            raise ValueError(f"label must be 'nominal' or 'executed', got {self.label!r}")
+        for name in ("outer_iterations", "episodes_per_iteration", "fit_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.evaluation_episodes < 0:
+            raise ValueError(
+                f"evaluation_episodes must not be negative, got {self.evaluation_episodes}"
+            )
+        if self.episode_steps is not None and self.episode_steps < 1:
+            raise ValueError(f"episode_steps must be at least 1 or null, got {self.episode_steps}")
+        if not 1 <= self.replan_every <= self.cem.horizon:
+            raise ValueError(
+                f"replan_every must be between 1 and cem.horizon ({self.cem.horizon}), got "
+                f"{self.replan_every}"
+            )
+        check_sampling(self.particles, self.propagation, self.precision)
