@@ -260,6 +260,17 @@ def test_evaluation_made_again_while_it_is_copied_is_made_here_too(
     assert not is_evaluated(this.directory, settings)
 
 
+def test_only_the_evaluations_of_this_campaign_are_copied(
+    write: Callable[..., Path], first: PlannedRun, tmp_path: Path
+) -> None:
+    other = EVALUATION | {"name": "other"}
+    (this,) = planned(write("second", [0], evaluations=[other]), tmp_path / "second")
+    copy_run(first.directory.path, this)
+    assert this.problem() is None
+    assert not list(this.directory.path.rglob("noisy.*"))
+    assert list(first.directory.path.rglob("noisy.*"))
+
+
 def test_reused_run_needs_no_device(
     write: Callable[..., Path], first: PlannedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

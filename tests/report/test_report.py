@@ -91,6 +91,14 @@ def test_report_joins_tables_and_figures(campaign: Path, tmp_path: Path) -> None
     assert "| -38.5 ± 0.5 |" in text
 
 
+def test_no_table_of_differences_without_pairs(write_run: WriteRun, tmp_path: Path) -> None:
+    for label in ("nominal", "executed"):
+        write_run([1], "l1=paper", f"label={label}")
+    page = report([tmp_path / "runs"])
+    assert "less baseline" not in page.read_text()
+    assert not (page.parent / "pairs.csv").exists()
+
+
 def test_tables_have_as_many_cells_as_columns(campaign: Path) -> None:
     text = report([campaign]).read_text()
     tables = re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)

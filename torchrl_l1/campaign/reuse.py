@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import filecmp
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +71,7 @@ def copy_run(source: Path, run: PlannedRun) -> None:
         config = read_config(copy.config_file)
         if not _finished(copy, config) or differences(config, run.settings()):
             raise OSError("it has changed meanwhile")
-        _forget_changed_evaluations(source, temporary)
+        _keep_evaluations(source, temporary, {settings.name for settings in run.evaluations})
         config["run_dir"] = str(target)
         write_atomically(copy.config_file, OmegaConf.to_yaml(OmegaConf.create(config)))
         if target.exists() and run.directory.free():
@@ -91,8 +91,14 @@ def _finished(directory: RunDirectory, config: Mapping[str, Any]) -> bool:
     return directory.iterations_done() == config.get("outer_iterations")
 
 
-def _forget_changed_evaluations(source: Path, copy: Path) -> None:
-    """Of a table made again while it was copied, remove the settings: it is then made here too."""
+def _keep_evaluations(source: Path, copy: Path, wanted: Set[str]) -> None:
+    """Remove tables nobody asked for here, and the settings of one that was made again meanwhile.
+
+    A table without its settings is made again.
+    """
+    for file in (copy / "evaluations").glob("*.*"):
+        if file.stem not in wanted:
+            file.unlink()
     for settings in (copy / "evaluations").glob("*.yaml"):
         names = [settings.with_suffix(".csv").name, settings.name]
         if filecmp.cmpfiles(source / "evaluations", settings.parent, names, False)[0] != names:

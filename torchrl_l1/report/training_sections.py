@@ -59,7 +59,7 @@ def _main_settings(study: Study) -> str:
 
 def _pairs(page: Page, study: Study) -> None:
     rows = paired_rows(study)
-    if not rows:
+    if not any(row["pairs"] for row in rows):
         return
     page.heading(
         "L1 less baseline",
