@@ -86,7 +86,9 @@ def test_arguments_reach_the_environment():
 
 
 def test_errors():
-    with pytest.raises(KeyError, match="Available: half_cheetah, hopper, inverted_pendulum"):
+    with pytest.raises(
+        KeyError, match="Available: cartpole, half_cheetah, hopper, inverted_pendulum"
+    ):
         make_env("pendulum", 2)
     for argument in ("action_noise", "observation_noise"):
         with pytest.raises(ValueError, match="half_width"):

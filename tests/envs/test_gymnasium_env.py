@@ -28,6 +28,7 @@ def test_names_and_horizons():
         "Hopper": 1000,
         "Walker": 1000,
         "HalfCheetah": 1000,
+        "Cartpole": 200,
     }
     registered = {
         spec.name: spec.max_episode_steps
@@ -170,7 +171,9 @@ class _Renderer:
         self.closed = True
 
 
-@pytest.mark.parametrize(("name", "camera"), [("walker", "track"), ("inverted_pendulum", -1)])
+@pytest.mark.parametrize(
+    ("name", "camera"), [("walker", "track"), ("inverted_pendulum", -1), ("cartpole", "track")]
+)
 def test_frames_show_the_current_state(monkeypatch, name, camera):
     monkeypatch.setattr(mujoco, "Renderer", _Renderer)
     env = MujocoTaskEnv(name, render_mode="rgb_array", width=800, height=60)

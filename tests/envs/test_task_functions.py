@@ -23,6 +23,10 @@ def _expected(name, imagined, before, action, after):
     """The published formulas, one transition of plain numbers at a time."""
     if name.startswith("inverted_pendulum"):
         return -(before[1] ** 2)
+    if name == "cartpole":
+        tip = (after[0] - 0.6 * math.sin(after[1]), -0.6 * math.cos(after[1]))
+        distance = math.dist(tip, (0.0, 0.6))
+        return math.exp(-((distance / 0.6) ** 2)) - 0.01 * action[0] ** 2
     if name == "swimmer":
         return (before if imagined else after)[8] - 1e-4 * sum(a * a for a in action)
     speed = before[5 if name == "hopper" else 8] - _clipped_cost(action)
@@ -100,7 +104,7 @@ def test_observation_layouts():
         np.testing.assert_array_equal(TASKS[name].observe(qpos, qvel, 7 * qpos), [expected])
     hopper = TASKS["hopper"].observe(qpos[:, :6], qvel[:, :6], qpos[:, :6])
     np.testing.assert_array_equal(hopper, [[1, 2, 3, 4, 5, 100, 101, 102, 103, 104, 105]])
-    for name in ("inverted_pendulum", "inverted_pendulum_unclamped"):
+    for name in ("inverted_pendulum", "inverted_pendulum_unclamped", "cartpole"):
         pendulum = TASKS[name].observe(qpos[:, 1:3], qvel[:, 3:5], qpos[:, 1:3])
         np.testing.assert_array_equal(pendulum, [[1, 2, 103, 104]])
 
@@ -143,3 +147,12 @@ def test_cheetah_resets():
     np.testing.assert_allclose(qvel.std(0), 0.1, rtol=0.03)
     np.testing.assert_allclose(qvel.mean(0), 0, atol=4e-3)
     assert np.abs(qvel).max() > 0.3  # normal, not uniform
+
+
+def test_cartpole_resets():
+    rng, start = np.random.default_rng(0), np.array([5.0, 0.0])
+    for values in TASKS["cartpole"].sample_reset(rng, start, start, 20_000):
+        assert values.shape == (20_000, 2)
+        np.testing.assert_allclose(values.std(0), 0.1, rtol=0.03)
+        np.testing.assert_allclose(values.mean(0), start, atol=4e-3)
+        assert np.abs(values - start).max() > 0.3  # normal, not uniform

@@ -32,7 +32,8 @@ class Task:
 
     Args:
         name: key of the task in :data:`~torchrl_l1.envs.TASKS`.
-        model_file: MuJoCo XML, relative to Gymnasium's asset folder, or an absolute path.
+        model_file: MuJoCo XML, relative to Gymnasium's asset folder, or an absolute path (as of one
+            that a package brings along).
         timestep: integration step of the XML in seconds.
         frame_skip: number of integration steps per environment step.
         horizon: environment steps after which an episode is truncated.

@@ -1,8 +1,9 @@
 """Observations, resets, rewards and terminations of the tasks, as plain batched functions.
 
-The facts are those of the authors' released code for arXiv 2403.14860 (METRPO part). Observations
-and resets are NumPy, rewards and terminations torch. ``observation`` is the state before the step,
-``next_observation`` the one after it; both are clean.
+The facts are those of the authors' released code for arXiv 2403.14860 (METRPO part), those of the
+cart-pole of the code released with arXiv 1805.12114. Observations and resets are NumPy, rewards and
+terminations torch. ``observation`` is the state before the step, ``next_observation`` the one after
+it; both are clean.
 """
 
 from __future__ import annotations
@@ -14,6 +15,10 @@ from torch import Tensor
 
 # Swimmer: the front end of its head in the frame of the body "torso", metres along that body.
 SWIMMER_TIP = 1.5
+
+# Cart-pole: from the hinge to the tip of the pole, metres; also how precisely the reward asks the
+# tip to be at its highest point.
+POLE_LENGTH = 0.6
 
 
 def observe_state(
@@ -43,6 +48,20 @@ def uniform_reset(
     """Uniform noise around the XML's pose and velocity."""
     qpos = qpos0 + rng.uniform(-half_width, half_width, (n, qpos0.size))
     qvel = qvel0 + rng.uniform(-half_width, half_width, (n, qvel0.size))
+    return qpos, qvel
+
+
+def normal_reset(
+    rng: np.random.Generator,
+    qpos0: np.ndarray,
+    qvel0: np.ndarray,
+    n: int,
+    *,
+    standard_deviation: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal noise around the XML's pose and velocity."""
+    qpos = qpos0 + standard_deviation * rng.standard_normal((n, qpos0.size))
+    qvel = qvel0 + standard_deviation * rng.standard_normal((n, qvel0.size))
     return qpos, qvel
 
 
@@ -106,6 +125,20 @@ def walker_imagined_reward(observation: Tensor, action: Tensor, next_observation
 def cheetah_reward(observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
     """Speed before the step less the control cost (clipped action)."""
     return observation[..., 8] - _control_cost(action)
+
+
+def cartpole_reward(observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
+    r"""How near the pole's tip is to its highest point over the middle of the rail, after the step.
+
+    :math:`e^{-d^2 / l^2} - 0.01 \lVert a \rVert^2`, with the distance d of the tip
+    :math:`(x - l \sin\theta, -l \cos\theta)` from :math:`(0, l)`, and the action as received,
+    unclipped. Upright in the middle and without force it is one, hanging there :math:`e^{-4}`.
+    """
+    x, theta = next_observation[..., 0], next_observation[..., 1]
+    across = x - POLE_LENGTH * theta.sin()
+    below = POLE_LENGTH * (1 + theta.cos())
+    nearness = torch.exp(-(across.square() + below.square()) / POLE_LENGTH**2)
+    return nearness - 0.01 * action.square().sum(-1)
 
 
 def never(next_observation: Tensor) -> Tensor:

@@ -5,13 +5,15 @@ real environments and the imagined rollouts of a model-based algorithm read the 
 they cannot drift apart; where the authors imagine another reward than the real one, the table says
 so (``reward_in_imagination``). The facts follow the authors' released code for arXiv 2403.14860,
 which builds on MBBL (arXiv:1907.02057); they differ from the ``-v4`` and ``-v5`` environments of
-Gymnasium, whose XML files (and nothing else) are used.
+Gymnasium, whose XML files (and nothing else) are used. The swing-up of a cart-pole follows the code
+of its own authors (arXiv 1805.12114) and has its XML file in this package.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 from . import task_functions as facts
 from .task import Task
@@ -116,6 +118,24 @@ _HALF_CHEETAH = Task(
     reward=facts.cheetah_reward,
 )
 
+# Observation: cart position (m), pole angle (rad, zero where it hangs, not wrapped), cart velocity,
+# angular velocity. The swing-up of arXiv 1805.12114, as in its authors' released code: the reward
+# sees the state after the step, an episode lasts 200 steps and nothing ends it early.
+_CARTPOLE = Task(
+    name="cartpole",
+    model_file=str(Path(__file__).parent / "assets" / "cartpole.xml"),
+    timestep=0.02,
+    frame_skip=2,
+    horizon=200,
+    observation_dim=4,
+    action_dim=1,
+    action_low=-3.0,
+    action_high=3.0,
+    observe=partial(facts.observe_state, skip=0),
+    sample_reset=partial(facts.normal_reset, standard_deviation=0.1),
+    reward=facts.cartpole_reward,
+)
+
 TASKS: dict[str, Task] = {
     task.name: task
     for task in (
@@ -125,6 +145,7 @@ TASKS: dict[str, Task] = {
         _HOPPER,
         _WALKER,
         _HALF_CHEETAH,
+        _CARTPOLE,
     )
 }
 """The tasks by name."""
