@@ -20,11 +20,10 @@ PACKAGES = (
 )
 
 
-def metrics_table() -> str:
-    """Every metric that METRPO logs, as a Markdown table."""
-    from torchrl_l1.algorithms.metrpo_metrics import METRICS
-
-    rows = [f"| `{name}` | {meaning} |" for name, meaning in METRICS.items()]
+def metrics_table(module: str) -> str:
+    """Every metric that an algorithm logs, as a Markdown table."""
+    metrics = importlib.import_module(f"torchrl_l1.algorithms.{module}").METRICS
+    rows = [f"| `{name}` | {meaning} |" for name, meaning in metrics.items()]
     return "\n".join(["| Metric | Meaning |", "|---|---|", *rows, ""])
 
 
@@ -61,7 +60,8 @@ def resolve_public_name(app: Any, env: Any, node: Any, contnode: Any) -> Any:
 
 def write(folder: Path) -> None:
     """Write all generated pages; files that would not change are left alone."""
-    pages = {"metrics": metrics_table()} | {f"api_{name}": api_page(name) for name in PACKAGES}
+    pages = {f"api_{name}": api_page(name) for name in PACKAGES}
+    pages |= {"metrics": metrics_table("metrpo_metrics"), "metrics_pets": metrics_table("pets")}
     folder.mkdir(exist_ok=True)
     for name, text in pages.items():
         path = folder / f"{name}.md"

@@ -133,9 +133,8 @@ def _evaluate_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
     add(
         "--policy",
         nargs="+",
-        default=["stochastic", "deterministic"],
         choices=["stochastic", "deterministic"],
-        help="sampled or mean actions",
+        help="sampled or mean actions; both by default, and sampled ones where they are the same",
     )
     add("--episodes", type=int, default=25, help="episodes per cell and run")
     add("--seed", type=int, default=0, help="seed of resets, noise and sampled actions")

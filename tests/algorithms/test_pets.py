@@ -18,6 +18,7 @@ L1 = L1Config(0.04, epsilon=0.2, action_low=-3.0, action_high=3.0)
 def tiny(head: str = "gaussian", **changes: object) -> PETSConfig:
     settings = {
         "outer_iterations": 2,
+        "random_episodes": 2,
         "episodes_per_iteration": 2,
         "particles": 3,
         "cem": CEMConfig(horizon=4, candidates=8, elites=2, iterations=2),
@@ -74,6 +75,7 @@ def test_short_episodes_are_measured_on_full_ones() -> None:
 def test_planner_balances_with_a_model_of_what_is_near_upright() -> None:
     """Random episodes of 8 steps end before the pole has fallen."""
     settings = {
+        "random_episodes": 20,
         "episodes_per_iteration": 20,
         "particles": 2,
         "cem": CEMConfig(horizon=12, candidates=60, elites=8, iterations=3),

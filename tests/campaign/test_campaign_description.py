@@ -19,7 +19,7 @@ from torchrl_l1.campaign.settings import CampaignError, RunMatrix
 from torchrl_l1.campaign.yaml_file import dump_yaml, load_yaml
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.recipes import RecipeError, available_campaigns, available_recipes
-from torchrl_l1.experiment.schema import L1Settings, l1_config
+from torchrl_l1.experiment.settings import L1Settings, l1_config
 
 RUNS = "runs: [{recipe: metrpo/inverted_pendulum, matrix: {l1: [off, paper], seed: [0, 1]}}]\n"
 

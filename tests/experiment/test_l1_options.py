@@ -16,7 +16,7 @@ from torchrl_l1.experiment.l1_options import (
     same_controller,
 )
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.schema import L1Settings
+from torchrl_l1.experiment.settings import L1Settings
 
 Recipe = Callable[..., DictConfig]
 

@@ -7,7 +7,6 @@ from omegaconf import OmegaConf
 from torchrl_l1.dynamics import ControlAffineDynamics, EnsembleDynamics
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import available_recipes
-from torchrl_l1.experiment.run import build
 from torchrl_l1.experiment.schema import METRPORecipe
 
 
@@ -17,7 +16,7 @@ def typed(name: str, *overrides: str) -> METRPORecipe:
     return recipe
 
 
-@pytest.mark.parametrize("name", available_recipes())
+@pytest.mark.parametrize("name", [n for n in available_recipes() if n.startswith("metrpo/")])
 def test_every_recipe_has_an_affine_variant_of_the_same_settings(name: str) -> None:
     for overrides in ([], ["preset=paper"], ["model.hidden=[8]"]):
         nonlinear, affine = typed(name, *overrides), typed(name, "model=affine", *overrides)
@@ -37,7 +36,7 @@ def test_the_recipe_wins_over_the_group_and_the_preset_over_both() -> None:
 )
 def test_the_form_reaches_the_algorithm(form: str, expected: type) -> None:
     recipe = typed("metrpo/half_cheetah", f"model={form}", "model.hidden=[64]", "horizon=5")
-    algorithm = build(recipe)
+    algorithm = recipe.build()
     assert type(algorithm.dynamics) is expected
     # 64 units of the nonlinear network in either case, counted in parameters.
     n, m = algorithm.task.observation_dim, algorithm.task.action_dim

@@ -10,13 +10,20 @@ from torchrl_l1.control import L1Config
 from torchrl_l1.envs import get_task
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import RecipeError, available_recipes, find_recipe
-from torchrl_l1.experiment.schema import METRPORecipe, l1_config
+from torchrl_l1.experiment.schema import METRPORecipe, PETSRecipe, schema_of
+from torchrl_l1.experiment.settings import RunSettings, l1_config
 
 RUN_DIR = "run_dir=unused"
 
 
-def typed(name: str, *overrides: str) -> METRPORecipe:
+def composed(name: str, *overrides: str) -> RunSettings:
     recipe = OmegaConf.to_object(compose(name, [RUN_DIR, *overrides]))
+    assert isinstance(recipe, RunSettings)
+    return recipe
+
+
+def typed(name: str, *overrides: str) -> METRPORecipe:
+    recipe = composed(name, *overrides)
     assert isinstance(recipe, METRPORecipe)
     return recipe
 
@@ -25,8 +32,10 @@ def typed(name: str, *overrides: str) -> METRPORecipe:
 @pytest.mark.parametrize("preset", ["cpu", "paper"])
 @pytest.mark.parametrize("l1", ["off", "paper", "reference", "slow"])
 def test_every_recipe_composes_and_says_which_task_it_is(name: str, preset: str, l1: str) -> None:
-    recipe = typed(name, f"preset={preset}", f"l1={l1}")
+    recipe = composed(name, f"preset={preset}", f"l1={l1}")
     assert recipe.recipe == name
+    algorithm = name.split("/")[0]
+    assert recipe.algorithm == {"dets": "pets"}.get(algorithm, algorithm)
     task = get_task(recipe.task)
     controller = l1_config(recipe.l1, recipe.task)
     assert (controller is None) == (l1 == "off")
@@ -73,6 +82,45 @@ def test_paper_preset_has_the_published_settings(
 
 
 @pytest.mark.parametrize(
+    ("name", "preset", "hidden", "candidates", "horizon", "decay"),
+    [
+        ("pets/inverted_pendulum", "paper", [200] * 4, 500, 30, 5e-5),
+        ("pets/half_cheetah", "paper", [200] * 4, 500, 30, 5e-5),
+        ("dets/half_cheetah", "paper", [200] * 4, 500, 30, 2e-4),
+        ("pets/cartpole", "paper_cartpole", [500] * 3, 400, 25, 2.5e-4),
+    ],
+)
+def test_paper_presets_of_pets_have_the_published_settings(
+    name: str, preset: str, hidden: list[int], candidates: int, horizon: int, decay: float
+) -> None:
+    recipe = composed(name, f"preset={preset}")
+    assert isinstance(recipe, PETSRecipe)
+    assert recipe.model.hidden == hidden
+    assert (recipe.cem.candidates, recipe.cem.horizon) == (candidates, horizon)
+    assert (recipe.cem.elites, recipe.cem.iterations, recipe.cem.momentum) == (
+        candidates // 10,
+        5,
+        0.1,
+    )
+    assert (recipe.particles, recipe.propagation, recipe.random_episodes) == (20, "tsinf", 1)
+    assert (recipe.fit.batch_size, recipe.fit.max_epochs) == (32, 5)
+    assert recipe.fit.bootstrap
+    # One for each layer, the output's last.
+    assert len(recipe.fit.weight_decay) == len(hidden) + 1
+    assert recipe.fit.weight_decay[-1] == decay
+    assert recipe.model.head == ("gaussian" if name.startswith("pets") else "deterministic")
+
+
+def test_algorithm_is_that_of_the_schema() -> None:
+    with pytest.raises(ValueError, match="algorithm is 'metrpo' by the recipe's schema"):
+        typed("metrpo/inverted_pendulum", "algorithm=pets")
+    assert schema_of({"task": "swimmer"}) is METRPORecipe, "older runs do not say"
+    assert schema_of({"algorithm": "pets"}) is PETSRecipe
+    with pytest.raises(ValueError, match="unknown algorithm 'pet'; there are metrpo, pets"):
+        schema_of({"algorithm": "pet"})
+
+
+@pytest.mark.parametrize(
     ("noise", "expected"),
     [("none", (0, 0)), ("action", (0.1, 0)), ("observation", (0, 0.1)), ("both", (0.1, 0.1))],
 )
@@ -113,3 +161,14 @@ def test_a_users_own_recipe_builds_on_the_shipped_groups(tmp_path: Path) -> None
     assert recipe.l1.alpha == 0.1
     assert recipe.model.hidden == [64]
     assert recipe.fit.batch_size == 500
+
+
+def test_a_users_own_recipe_finds_the_groups_of_its_algorithm(tmp_path: Path) -> None:
+    own = tmp_path / "mine.yaml"
+    own.write_text(
+        "defaults: [pets_recipe, {l1: slow}, {preset: paper}, _self_]\n"
+        "recipe: mine\ntask: swimmer\nparticles: 7\n"
+    )
+    recipe = composed(str(own))
+    assert isinstance(recipe, PETSRecipe)
+    assert (recipe.particles, recipe.cem.candidates) == (7, 500)

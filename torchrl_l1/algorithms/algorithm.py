@@ -1,8 +1,14 @@
-"""What an outer iteration of any algorithm reports."""
+"""What every algorithm is to those who run, save and evaluate it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+from torchrl_l1.algorithms.collection import Collection
+from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.envs import Task
 
 
 @dataclass
@@ -11,3 +17,43 @@ class IterationResult:
 
     metrics: dict[str, float]
     seconds: dict[str, float]
+
+
+class Algorithm(Protocol):
+    """A model-based algorithm and its state.
+
+    Attributes:
+        stochastic: whether acting with sampled actions and with mean actions differ.
+        iteration: outer iterations that are complete.
+        task: what it learns.
+        collection: the real environments that it learns in, with the policy that acts in them.
+        acting_dynamics: the model that L1 uses there, on the CPU.
+        on_phase: called with a word on what is going on, for progress bars.
+    """
+
+    stochastic: ClassVar[bool]
+    iteration: int
+    task: Task
+    collection: Collection
+    acting_dynamics: EnsembleDynamics
+    on_phase: Callable[[str], None]
+
+    def iterate(self) -> Iterator[IterationResult]:
+        """Run the outer iterations that are left, reporting after each."""
+        ...
+
+    def choices(self) -> Mapping[str, str]:
+        """What settings that say ``auto`` have become on this machine."""
+        ...
+
+    def weights(self) -> Mapping[str, dict[str, Any]]:
+        """State dicts of what has been learned, by the names under which users look for them."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to continue, as plain tensors and numbers."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        ...

@@ -13,10 +13,11 @@ from copy import deepcopy
 from functools import partial
 from itertools import pairwise
 from time import perf_counter
-from typing import Any
+from typing import Any, ClassVar
 
 from tensordict import TensorDictBase
 
+from torchrl_l1.algorithms.algorithm import IterationResult
 from torchrl_l1.algorithms.collection import (
     Collection,
     Perturbation,
@@ -25,9 +26,9 @@ from torchrl_l1.algorithms.collection import (
     signal_metrics,
 )
 from torchrl_l1.algorithms.device import resolve_device
-from torchrl_l1.algorithms.iteration import IterationResult
+from torchrl_l1.algorithms.metrics import fit_metrics
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig, check_clipping
-from torchrl_l1.algorithms.metrpo_metrics import fit_metrics, policy_metrics
+from torchrl_l1.algorithms.metrpo_metrics import policy_metrics
 from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.policy import GaussianPolicy, acting
 from torchrl_l1.algorithms.policy_improvement import PolicyImprovement
@@ -59,6 +60,8 @@ class METRPO:
     Raises:
         ValueError: if L1 is on and ``clip_actions`` is off.
     """
+
+    stochastic: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -165,6 +168,14 @@ class METRPO:
             **return_metrics(sampled),
             "return_deterministic": mean_action.mean().item(),
         }
+
+    def choices(self) -> dict[str, str]:
+        """Where models are fitted and trajectories imagined."""
+        return {"device": str(self.device)}
+
+    def weights(self) -> dict[str, dict[str, Any]]:
+        """State dicts of model and policy."""
+        return {"model": self.dynamics.state_dict(), "policy": self.policy.state_dict()}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue, as plain tensors and numbers."""

@@ -10,13 +10,15 @@ what is learned is the model. With L1 on, the adaptive controller augments the p
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from copy import deepcopy
 from functools import partial
 from itertools import pairwise
 from time import perf_counter
-from typing import Any
+from typing import Any, ClassVar
 
 from tensordict import TensorDictBase
 
+from torchrl_l1.algorithms.algorithm import IterationResult
 from torchrl_l1.algorithms.collection import (
     Collection,
     Perturbation,
@@ -24,8 +26,8 @@ from torchrl_l1.algorithms.collection import (
     return_metrics,
     signal_metrics,
 )
-from torchrl_l1.algorithms.iteration import IterationResult
-from torchrl_l1.algorithms.metrpo_metrics import fit_metrics
+from torchrl_l1.algorithms.device import resolve_device
+from torchrl_l1.algorithms.metrics import COMMON, L1, fit_metrics
 from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.pets_config import PETSConfig
 from torchrl_l1.algorithms.seeding import seed_streams
@@ -33,7 +35,19 @@ from torchrl_l1.control import L1Config
 from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.dynamics import make_dynamics
 from torchrl_l1.envs import get_task
-from torchrl_l1.planning import ModelPredictiveController, TrajectorySampler
+from torchrl_l1.planning import ModelPredictiveController, TrajectorySampler, resolve_precision
+
+METRICS: dict[str, str] = {
+    **COMMON,
+    "return_mean": "Mean return of full real episodes, with L1 if it is on: those that join the "
+    "data, or `evaluation_episodes` beside them if these are asked for or the data's are shorter.",
+    "return_deterministic": "The same: the planner acts in one way only.",
+    "plan/promised_return": "Mean over the collected steps of the imagined return of the best "
+    "sequence that the last plan has seen. Far above what comes, it says that plans exploit the "
+    "model.",
+    **L1,
+}
+"""Every metric of :class:`PETS`; ``l1/...`` only with L1 on."""
 
 
 class PETS:
@@ -47,10 +61,14 @@ class PETS:
         seed: seed of every random stream. Streams are derived anew from the seed and the
             iteration's number, so that a resumed run draws what an unbroken one would have.
         horizon: steps per real episode; the task's own by default.
+        device: where models are fitted and plans are made: ``cpu``, ``cuda`` or ``auto``. Real
+            environments, and the copy of the model that L1 uses in them, are on the CPU.
         compile_l1: whether to compile the controller's step, see
             :class:`~torchrl_l1.control.L1Transform`.
         on_phase: called with a word on what is going on, for progress bars.
     """
+
+    stochastic: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -60,15 +78,19 @@ class PETS:
         perturbation: Perturbation | None = None,
         seed: int = 0,
         horizon: int | None = None,
+        device: str = "cpu",
         compile_l1: CompileMode = False,
         on_phase: Callable[[str], None] | None = None,
     ) -> None:
         self.config, self.seed = config, seed
+        self.device = resolve_device(device)
         self.on_phase = on_phase or (lambda phase: None)
         self.task = get_task(task)
         n, m = self.task.observation_dim, self.task.action_dim
         seed_streams(seed, "initialisation")
-        self.dynamics = make_dynamics(n, m, **vars(config.model))
+        self.dynamics = make_dynamics(n, m, **vars(config.model)).to(self.device)
+        on_cpu = self.device.type == "cpu"
+        self.acting_dynamics = self.dynamics if on_cpu else deepcopy(self.dynamics).cpu()
         sampler = TrajectorySampler(
             self.dynamics,
             self.task.imagined_reward,
@@ -88,17 +110,19 @@ class PETS:
             Collection,
             self.task,
             policy=self.policy,
-            dynamics=self.dynamics,
+            dynamics=self.acting_dynamics,
             l1=l1,
             perturbation=perturbation or Perturbation(),
             compile_l1=compile_l1,
         )
         full = horizon or self.task.horizon
-        self.collection = real(
-            episodes=config.episodes_per_iteration, horizon=min(config.episode_steps or full, full)
+        steps = min(config.episode_steps or full, full)
+        self.start = real(
+            episodes=config.random_episodes, horizon=min(config.random_steps or steps, full)
         )
+        self.collection = real(episodes=config.episodes_per_iteration, horizon=steps)
         self.evaluation = real(episodes=max(config.evaluation_episodes, 1), horizon=full)
-        capacity = (config.outer_iterations + 1) * self.collection.frames
+        capacity = self.start.frames + config.outer_iterations * self.collection.frames
         self.learning = ModelLearning(self.dynamics, config.fit, config.label, capacity)
         self.fit_report: dict[str, float] = {}
         self.iteration = 0
@@ -111,12 +135,13 @@ class PETS:
             clock = [perf_counter()]
             if len(self.learning.buffer) == 0:
                 self.on_phase("random data")
-                self.learning.store(self.collection.random(self.seed))
+                self.learning.store(self.start.random(self.seed))
             clock.append(perf_counter())
 
             if self.iteration % config.fit_every == 0:
                 report = self.learning.fit(lambda epoch: self.on_phase(f"fit, epoch {epoch}"))
                 self.fit_report = fit_metrics(report)
+                self.acting_dynamics.load_state_dict(self.dynamics.state_dict())
             clock.append(perf_counter())
 
             self.on_phase("planning and collecting")
@@ -129,7 +154,7 @@ class PETS:
 
             metrics = {
                 "iteration": self.iteration,
-                "real_steps": (self.iteration + 2) * self.collection.frames,
+                "real_steps": self.start.frames + (self.iteration + 1) * self.collection.frames,
                 **returns,
                 **signal_metrics(data),
                 **self.fit_report,
@@ -151,6 +176,15 @@ class PETS:
         returns = return_metrics(data)
         return {**returns, "return_deterministic": episode_returns(data).mean().item()}
 
+    def choices(self) -> dict[str, str]:
+        """Where plans are made, and in which precision."""
+        precision = resolve_precision(self.config.precision, self.device)
+        return {"device": str(self.device), "precision": precision}
+
+    def weights(self) -> dict[str, dict[str, Any]]:
+        """State dict of the model: there is nothing else."""
+        return {"model": self.dynamics.state_dict()}
+
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue, as plain tensors and numbers."""
         return {
@@ -164,3 +198,4 @@ class PETS:
         self.iteration = state["iteration"]
         self.fit_report = state["fit_report"]
         self.learning.load_state_dict(state)
+        self.acting_dynamics.load_state_dict(self.dynamics.state_dict())

@@ -18,8 +18,10 @@ class PETSConfig:
 
     Attributes:
         outer_iterations: rounds of fit and collection.
-        episodes_per_iteration: real episodes per round (and of random data before the first),
-            run side by side.
+        random_episodes: real episodes of random actions before the first round.
+        random_steps: steps of each; those of a collected episode if null. On a task that random
+            actions fail at once, many short episodes show more of what matters than a long one.
+        episodes_per_iteration: real episodes per round, run side by side.
         episode_steps: steps of a collected episode; the task's horizon if null. Returns are then
             measured on full episodes that do not join the data.
         evaluation_episodes: full episodes beside the data after each round; none by default,
@@ -39,6 +41,8 @@ class PETSConfig:
     """
 
     outer_iterations: int = 20
+    random_episodes: int = 1
+    random_steps: int | None = None
     episodes_per_iteration: int = 1
     episode_steps: int | None = None
     evaluation_episodes: int = 0
@@ -60,15 +64,17 @@ class PETSConfig:
         """
         if self.label not in ("nominal", "executed"):
             raise ValueError(f"label must be 'nominal' or 'executed', got {self.label!r}")
-        for name in ("outer_iterations", "episodes_per_iteration", "fit_every"):
+        for name in ("outer_iterations", "random_episodes", "episodes_per_iteration", "fit_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.evaluation_episodes < 0:
             raise ValueError(
                 f"evaluation_episodes must not be negative, got {self.evaluation_episodes}"
             )
-        if self.episode_steps is not None and self.episode_steps < 1:
-            raise ValueError(f"episode_steps must be at least 1 or null, got {self.episode_steps}")
+        for name in ("episode_steps", "random_steps"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1 or null, got {value}")
         if not 1 <= self.replan_every <= self.cem.horizon:
             raise ValueError(
                 f"replan_every must be between 1 and cem.horizon ({self.cem.horizon}), got "

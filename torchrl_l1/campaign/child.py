@@ -58,9 +58,9 @@ def train(settings: Mapping[str, Any]) -> None:
     from torchrl_l1.experiment.errors import USER_ERRORS, message
     from torchrl_l1.experiment.run import run
     from torchrl_l1.experiment.run_directory import RunDirectoryInUse
-    from torchrl_l1.experiment.schema import METRPORecipe
+    from torchrl_l1.experiment.schema import schema_of
 
-    config = OmegaConf.merge(OmegaConf.structured(METRPORecipe), dict(settings))
+    config = OmegaConf.merge(OmegaConf.structured(schema_of(settings)), dict(settings))
     assert isinstance(config, DictConfig)
     try:
         run(config)

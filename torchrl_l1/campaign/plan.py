@@ -21,9 +21,8 @@ from torchrl_l1.envs import get_task
 from torchrl_l1.experiment.errors import USER_ERRORS, message
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import group_setting
-from torchrl_l1.experiment.run import compile_mode
 from torchrl_l1.experiment.run_directory import RunDirectory
-from torchrl_l1.experiment.schema import METRPORecipe, l1_config
+from torchrl_l1.experiment.settings import RunSettings, compile_mode, l1_config
 from torchrl_l1.experiment.tracking import check_mode
 
 
@@ -89,8 +88,11 @@ def _runs(index: int, matrix: RunMatrix, output: Path) -> Iterator[PlannedRun]:
 
 def _check(config: DictConfig) -> None:
     recipe = OmegaConf.to_object(config)
-    if not isinstance(recipe, METRPORecipe):
-        raise ValueError("the recipe has no schema; put metrpo_recipe first in its defaults")
+    if not isinstance(recipe, RunSettings):
+        raise ValueError(
+            "the recipe has no schema; put that of its algorithm, such as metrpo_recipe, first in "
+            "its defaults"
+        )
     get_task(recipe.task)
     l1_config(recipe.l1, recipe.task)
     compile_mode(recipe.l1.compile)

@@ -79,6 +79,11 @@ class EnsembleDynamics(nn.Module):
         """Number of networks in the ensemble, elites or not."""
         return self.network.members
 
+    @property
+    def device(self) -> torch.device:
+        """Where the model is."""
+        return self.change_normalizer.mean.device
+
     def set_elites(self, index: Sequence[int] | Tensor) -> None:
         """Say which members count in the ensemble's mean, and are drawn where one is drawn.
 

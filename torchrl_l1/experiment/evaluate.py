@@ -10,6 +10,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from torchrl_l1.algorithms.algorithm import Algorithm
 from torchrl_l1.algorithms.collection import (
     Collection,
     Perturbation,
@@ -17,7 +18,7 @@ from torchrl_l1.algorithms.collection import (
     return_metrics,
     signal_metrics,
 )
-from torchrl_l1.algorithms.metrpo import METRPO
+from torchrl_l1.experiment.finding import read_config
 from torchrl_l1.experiment.l1_options import (
     closest_option,
     controller_label,
@@ -25,9 +26,9 @@ from torchrl_l1.experiment.l1_options import (
     same_controller,
 )
 from torchrl_l1.experiment.recipes import group_setting
-from torchrl_l1.experiment.run import build
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
-from torchrl_l1.experiment.schema import L1Settings, METRPORecipe, l1_config
+from torchrl_l1.experiment.schema import schema_of
+from torchrl_l1.experiment.settings import L1Settings, RunSettings, l1_config
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,8 @@ class TrainedRun:
     """A finished or running training, loaded for evaluation."""
 
     path: Path
-    recipe: METRPORecipe
-    algorithm: METRPO
+    recipe: RunSettings
+    algorithm: Algorithm
 
 
 def load_run(path: str | Path) -> TrainedRun:
@@ -80,10 +81,11 @@ def load_run(path: str | Path) -> TrainedRun:
     checkpoint = directory.load_checkpoint()
     if checkpoint is None:
         raise RunDirectoryError(f"the run in {path} has no checkpoint yet; let it finish first")
-    stored = OmegaConf.load(directory.config_file)
-    recipe = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(METRPORecipe), stored))
-    assert isinstance(recipe, METRPORecipe)
-    algorithm = build(replace(recipe, device="cpu"))
+    stored = read_config(directory.config_file)
+    schema = OmegaConf.structured(schema_of(stored))
+    recipe = OmegaConf.to_object(OmegaConf.merge(schema, stored))
+    assert isinstance(recipe, RunSettings)
+    algorithm = replace(recipe, device="cpu").build()
     algorithm.load_state_dict({**checkpoint["algorithm"], "buffer": {}})
     return TrainedRun(directory.path, recipe, algorithm)
 

@@ -20,13 +20,13 @@ from torchrl_l1.experiment.l1_options import check_tuning
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.robustness import plot_robustness, summarize, table
 from torchrl_l1.experiment.run_directory import write_table
-from torchrl_l1.experiment.schema import METRPORecipe, WandbSettings
+from torchrl_l1.experiment.settings import RunSettings, WandbSettings
 
 
 def _check_one_study(runs: Sequence[TrainedRun]) -> None:
     """Runs may differ in their seed and in nothing that matters."""
 
-    def settings(trained: TrainedRun) -> METRPORecipe:
+    def settings(trained: TrainedRun) -> RunSettings:
         return replace(trained.recipe, seed=0, run_dir="", resume=False, wandb=WandbSettings())
 
     for trained in runs[1:]:
@@ -41,9 +41,6 @@ def evaluate_command(options: argparse.Namespace) -> None:
     """``torchrl-l1 evaluate``: table on the screen, CSV, PNG and, if asked, a filmstrip."""
     tuning = (options.epsilon, options.alpha)
     check_tuning(*tuning, prefix="--")
-    cells = conditions(
-        options.l1, options.noise, options.bias, options.gain, options.policy, *tuning
-    )
     for name in options.l1:
         group_setting("l1", name)
     for name in options.noise:
@@ -52,6 +49,10 @@ def evaluate_command(options: argparse.Namespace) -> None:
         raise ValueError(f"--episodes must be positive, got {options.episodes}")
     runs = [load_run(path) for path in dict.fromkeys(map(Path, options.run_dir))]
     _check_one_study(runs)
+    policies = options.policy or (
+        ["stochastic", "deterministic"] if runs[0].algorithm.stochastic else ["stochastic"]
+    )
+    cells = conditions(options.l1, options.noise, options.bias, options.gain, policies, *tuning)
     output = Path(options.output) if options.output else runs[0].path / "evaluation"
     rows = []
     total = len(runs) * len(cells)

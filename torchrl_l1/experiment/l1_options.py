@@ -9,7 +9,7 @@ from functools import cache
 from typing import Any
 
 from torchrl_l1.experiment.recipes import group_options, group_setting
-from torchrl_l1.experiment.schema import L1Settings, l1_config
+from torchrl_l1.experiment.settings import L1Settings, l1_config
 
 __all__ = [
     "check_tuning",

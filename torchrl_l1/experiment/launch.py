@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import hydra
+import yaml  # type: ignore[import-untyped]
 from hydra.errors import CompactHydraException
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from torchrl_l1.experiment.errors import USER_ERRORS, message
 from torchrl_l1.experiment.recipes import find_recipe, recipes_dir, shared_dir
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.schema import register
+from torchrl_l1.experiment.schema import SCHEMAS, register
 
 # The run directory is ours to open, so Hydra must not create or write to it first.
 _HYDRA_SETTINGS = [
@@ -83,12 +84,21 @@ def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:
 
 
 def _search_path(recipe: Path) -> list[str]:
-    folders = [shared_dir()]
-    if not recipe.is_relative_to(recipes_dir()):
-        # A user's own recipe may build on the shipped groups.
-        folders.append(recipes_dir() / "metrpo")
+    """Where Hydra looks for groups: beside the recipe, in ``shared`` and with its algorithm."""
+    groups = [recipes_dir() / name for name in _algorithms(recipe)]
+    folders = [shared_dir(), *(folder for folder in groups if folder != recipe.parent)]
     quoted = ",".join(f"'file://{folder}'" for folder in folders)
     return [f"hydra.searchpath=[{quoted}]"]
+
+
+def _algorithms(recipe: Path) -> list[str]:
+    """Those whose schemas are among a recipe's defaults."""
+    try:
+        content = OmegaConf.to_container(OmegaConf.load(recipe))
+    except (OSError, ValueError, yaml.YAMLError):
+        return []  # Hydra says what is wrong with it
+    defaults = content.get("defaults") if isinstance(content, dict) else None
+    return [name for name in SCHEMAS if f"{name}_recipe" in (defaults or [])]
 
 
 def _task(config: DictConfig) -> None:

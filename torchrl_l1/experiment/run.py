@@ -12,10 +12,9 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from torchrl_l1.algorithms import METRPO
-from torchrl_l1.control.compilation import CompileMode
+from torchrl_l1.algorithms.algorithm import Algorithm
 from torchrl_l1.experiment.run_directory import RunDirectory, save_atomically, write_table
-from torchrl_l1.experiment.schema import METRPORecipe, algorithm_config, l1_config
+from torchrl_l1.experiment.settings import RunSettings
 from torchrl_l1.experiment.tracking import Tracker, check_mode
 from torchrl_l1.experiment.versions import versions
 
@@ -36,19 +35,19 @@ def run(config: DictConfig) -> Path:
     resolved = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(resolved, dict)
     recipe = OmegaConf.to_object(config)
-    assert isinstance(recipe, METRPORecipe)
+    assert isinstance(recipe, RunSettings)
     settings = {str(key): value for key, value in resolved.items()}
     check_mode(recipe.wandb.mode)
     torch.set_num_threads(recipe.threads)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     progress = tqdm(
-        total=recipe.outer_iterations,
+        total=config.outer_iterations,
         desc=f"{recipe.recipe} seed {recipe.seed}",
         unit="iteration",
         disable=None,
     )
     with progress:
-        algorithm = build(recipe)
+        algorithm = recipe.build()
         algorithm.on_phase = lambda phase: progress.set_postfix_str(phase)
         directory = RunDirectory(recipe.run_dir)
         with directory.open(settings, recipe.resume):
@@ -57,34 +56,9 @@ def run(config: DictConfig) -> Path:
     return directory.path
 
 
-def build(recipe: METRPORecipe) -> METRPO:
-    """The algorithm that a recipe describes, fresh."""
-    return METRPO(
-        recipe.task,
-        algorithm_config(recipe),
-        l1=l1_config(recipe.l1, recipe.task),
-        perturbation=recipe.perturbation,
-        seed=recipe.seed,
-        horizon=recipe.horizon,
-        device=recipe.device,
-        compile_l1=compile_mode(recipe.l1.compile),
-    )
-
-
-def compile_mode(setting: bool | str) -> CompileMode:
-    """Check ``l1.compile``.
-
-    Raises:
-        ValueError: if it is none of true, false and auto.
-    """
-    if setting not in (True, False, "auto"):
-        raise ValueError(f"l1.compile must be true, false or auto, got {setting!r}")
-    return setting  # type: ignore[return-value]
-
-
 def _run(
-    algorithm: METRPO,
-    recipe: METRPORecipe,
+    algorithm: Algorithm,
+    recipe: RunSettings,
     settings: dict[str, Any],
     directory: RunDirectory,
     progress: tqdm,
@@ -99,17 +73,19 @@ def _run(
         if directory.iterations_done() < len(rows):
             # A kill has come between the checkpoint and the files made from it.
             _write_results(algorithm, directory, rows, timings)
-        if len(rows) >= recipe.outer_iterations:
+        if len(rows) >= settings["outer_iterations"]:
             progress.write(f"{directory.path} is complete: nothing to do")
             return
     run_id = hashlib.sha256(str(directory.path.resolve()).encode()).hexdigest()[:12]
     tracker = Tracker(
         recipe.wandb.mode,
         recipe.wandb.project,
-        {**settings, "versions": versions()},
+        {**settings, "versions": versions(), "choices": dict(algorithm.choices())},
         directory.path,
         run_id,
     )
+    choices = (f"{name} {value}" for name, value in algorithm.choices().items())
+    progress.write(f"{recipe.recipe}: {', '.join(choices)}")
     with closing(tracker):
         if rows:
             # A kill may have come between the last checkpoint and its log entry.
@@ -131,13 +107,13 @@ def _run(
 
 
 def _write_results(
-    algorithm: METRPO,
+    algorithm: Algorithm,
     directory: RunDirectory,
     rows: list[dict[str, Any]],
     timings: list[dict[str, Any]],
 ) -> None:
-    save_atomically(directory.path / "model.pt", algorithm.dynamics.state_dict())
-    save_atomically(directory.path / "policy.pt", algorithm.policy.state_dict())
+    for name, state in algorithm.weights().items():
+        save_atomically(directory.path / f"{name}.pt", state)
     write_table(directory.timing_file, timings)
     # Last: whoever finds the last row takes the run for finished and never comes back to it.
     write_table(directory.metrics_file, rows)

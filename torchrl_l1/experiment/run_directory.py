@@ -15,7 +15,8 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 
-from torchrl_l1.experiment.schema import VOLATILE_KEYS, flatten, schema_defaults
+from torchrl_l1.experiment.schema import schema_defaults
+from torchrl_l1.experiment.settings import VOLATILE_KEYS, flatten
 from torchrl_l1.experiment.versions import versions
 
 # What a run killed in its first moments may leave behind; its directory is still free.
@@ -170,8 +171,9 @@ def differences(
         >>> differences(before, now, may_grow=True)
         ['seed: 0 there, 1 now']
     """
+    defaults = schema_defaults(now)
     before, now = flatten(before), flatten(now)
-    before = {k: v for k, v in schema_defaults().items() if k in now} | before
+    before = {k: v for k, v in defaults.items() if k in now} | before
     if may_grow and before.get(_MAY_GROW, 0) < now.get(_MAY_GROW, 0):
         before[_MAY_GROW] = now[_MAY_GROW]
     return [

@@ -1,19 +1,18 @@
-"""What a recipe may contain: the typed schema behind the YAML files."""
+"""Settings of every recipe, whatever the algorithm."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from functools import cache
+from dataclasses import dataclass, field
 from typing import Any
 
-from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING, OmegaConf
+from omegaconf import MISSING
 
-from torchrl_l1.algorithms import METRPOConfig, Perturbation
+from torchrl_l1.algorithms import Perturbation
+from torchrl_l1.algorithms.algorithm import Algorithm
 from torchrl_l1.algorithms.device import DEVICES
-from torchrl_l1.algorithms.metrpo_config import check_clipping
 from torchrl_l1.control import L1Config
+from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.envs import get_task
 
 
@@ -63,9 +62,11 @@ class WandbSettings:
 
 @dataclass
 class RunSettings:
-    """Settings of every recipe, whatever the algorithm.
+    """Settings of every recipe; subclasses add those of their algorithm.
 
     Attributes:
+        algorithm: the algorithm's name, fixed by the recipe's schema.
+        outer_iterations: rounds of the algorithm.
         recipe: the recipe's name, as given on the command line.
         task: a task of :data:`torchrl_l1.envs.TASKS`.
         seed: seed of every random stream.
@@ -74,12 +75,13 @@ class RunSettings:
         threads: CPU threads of torch.
         device: ``cpu``, ``cuda`` or ``auto`` (CUDA where there is one).
         horizon: steps per real episode; the task's own if null.
-        published_horizon: imagined horizon of the published runs, for ``preset=paper``.
         l1: see :class:`L1Settings`.
         perturbation: noise and disturbances of the real environment.
         wandb: see :class:`WandbSettings`.
     """
 
+    algorithm: str = MISSING
+    outer_iterations: int = MISSING
     recipe: str = MISSING
     task: str = MISSING
     seed: int = 0
@@ -88,7 +90,6 @@ class RunSettings:
     threads: int = 1
     device: str = "cpu"
     horizon: int | None = None
-    published_horizon: int = 1000
     l1: L1Settings = field(default_factory=L1Settings)
     perturbation: Perturbation = field(default_factory=Perturbation)
     wandb: WandbSettings = field(default_factory=WandbSettings)
@@ -102,37 +103,30 @@ class RunSettings:
         Raises:
             ValueError: naming the setting.
         """
+        fixed = type(self).algorithm
+        if self.algorithm != fixed:
+            raise ValueError(
+                f"algorithm is {fixed!r} by the recipe's schema, got {self.algorithm!r}; choose "
+                f"a recipe of {self.algorithm} instead"
+            )
         if self.device not in DEVICES:
             raise ValueError(f"device must be {' or '.join(DEVICES)}, got {self.device!r}")
-        for name in ("threads", "published_horizon"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.threads < 1:
+            raise ValueError(f"threads must be at least 1, got {self.threads}")
         if self.horizon is not None and self.horizon < 1:
             raise ValueError(f"horizon must be at least 1 or null, got {self.horizon}")
 
-
-@dataclass
-class METRPORecipe(RunSettings, METRPOConfig):
-    """A METRPO recipe: run settings and the algorithm's own, side by side."""
-
-    def __post_init__(self) -> None:
-        """Check both parts, and that they fit each other.
+    def build(self) -> Algorithm:
+        """The algorithm that the recipe describes, fresh.
 
         Raises:
-            ValueError: naming the setting.
+            ValueError: if settings contradict each other.
         """
-        RunSettings.__post_init__(self)
-        METRPOConfig.__post_init__(self)
-        check_clipping(self.clip_actions, self.l1.enabled)
+        raise NotImplementedError  # a recipe's schema says which algorithm it is
 
 
 # Keys that may differ between a run and its continuation: they do not touch the result.
 VOLATILE_KEYS = ("run_dir", "resume", "wandb")
-
-
-def register() -> None:
-    """Make the schemas known to Hydra."""
-    ConfigStore.instance().store(name="metrpo_recipe", node=METRPORecipe)
 
 
 def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
@@ -148,18 +142,6 @@ def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
     for key, value in node.items():
         flat.update(flatten(value, f"{prefix}.{key}" if prefix else str(key)))
     return flat
-
-
-@cache
-def schema_defaults() -> Mapping[str, Any]:
-    """Every key of the schema that has a default, dotted, with that default."""
-    node = OmegaConf.to_container(OmegaConf.structured(METRPORecipe))
-    return {key: value for key, value in flatten(node).items() if value != MISSING}
-
-
-def algorithm_config(recipe: METRPORecipe) -> METRPOConfig:
-    """The algorithm's part of a recipe."""
-    return METRPOConfig(**{f.name: getattr(recipe, f.name) for f in fields(METRPOConfig)})
 
 
 def l1_config(settings: L1Settings, task_name: str) -> L1Config | None:
@@ -184,3 +166,14 @@ def l1_config(settings: L1Settings, task_name: str) -> L1Config | None:
         action_low=task.action_low,
         action_high=task.action_high,
     )
+
+
+def compile_mode(setting: bool | str) -> CompileMode:
+    """Check ``l1.compile``.
+
+    Raises:
+        ValueError: if it is none of true, false and auto.
+    """
+    if setting not in (True, False, "auto"):
+        raise ValueError(f"l1.compile must be true, false or auto, got {setting!r}")
+    return setting  # type: ignore[return-value]

@@ -44,7 +44,8 @@ class ModelPredictiveController(TensorDictModuleBase):
     (:class:`~torchrl.envs.InitTracker`), if there is one, restarts it as well.
 
     The model is referred to, not registered: its weights are not among this module's
-    parameters, and updating them in place is seen by the next plan.
+    parameters, and updating them in place is seen by the next plan. Plans are made on the
+    model's device, wherever the observations are.
 
     Args:
         sampler: model, reward and how they are used.
@@ -136,8 +137,8 @@ class ModelPredictiveController(TensorDictModuleBase):
         batch = tensordict.batch_size
         observation = self._observation(tensordict)
         count = batch.numel()
-        flat = observation.reshape(count, -1)
-        device = flat.device
+        device = self.sampler.dynamics.device
+        flat = observation.reshape(count, -1).to(device)
         mean, step, best_return = (
             self._state(tensordict, name).to(device).reshape(count, *shape)
             for name, (shape, _) in self._spec.items()
@@ -165,12 +166,12 @@ class ModelPredictiveController(TensorDictModuleBase):
             "step": (step + 1)[:, None],
             "best_return": best_return,
         }
-        tensordict.set(self.action_key, sequence[:, 0].reshape(*batch, -1))
+        tensordict.set(self.action_key, sequence[:, 0].reshape(*batch, -1).to(observation.device))
         tensordict.set(
             ("next", self.key),
             TensorDict(
                 {
-                    name: value.reshape(*batch, *value.shape[1:])
+                    name: value.reshape(*batch, *value.shape[1:]).to(observation.device)
                     for name, value in following.items()
                 },
                 batch_size=batch,

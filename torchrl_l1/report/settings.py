@@ -12,7 +12,8 @@ from omegaconf import OmegaConf
 from torchrl_l1.control.config import DEFAULT_ALPHA
 from torchrl_l1.experiment.l1_options import closest_option, departures, filter_gain
 from torchrl_l1.experiment.recipes import shared_dir
-from torchrl_l1.experiment.schema import VOLATILE_KEYS, L1Settings, flatten, schema_defaults
+from torchrl_l1.experiment.schema import schema_defaults
+from torchrl_l1.experiment.settings import VOLATILE_KEYS, L1Settings, flatten
 
 __all__ = ["BASELINE", "NOISES", "Identity", "identify"]
 
@@ -34,6 +35,7 @@ class Identity:
     """What a run is one sample of.
 
     Attributes:
+        algorithm: ``metrpo``, ``pets``, or ``dets`` for PETS with members that predict points.
         task: such as ``half_cheetah``.
         noise: option of the ``noise`` group that its noise is equal to, else the noise in words.
         arm: ``off``, or the option of the ``l1`` group that its controller is closest to,
@@ -49,6 +51,7 @@ class Identity:
             none.
     """
 
+    algorithm: str
     task: str
     noise: str
     arm: str
@@ -75,7 +78,7 @@ def identify(config: Mapping[str, Any]) -> Identity:
         KeyError: if it lacks a key that every run has.
         ValueError: if such a key has no usable value.
     """
-    settings = {**schema_defaults(), **flatten(config)}
+    settings = {**schema_defaults(config), **flatten(config)}
     for key in ("task", "seed", "outer_iterations"):
         if settings.get(key) in (None, "???"):
             raise KeyError(f"the configuration has no {key}")
@@ -93,6 +96,7 @@ def identify(config: Mapping[str, Any]) -> Identity:
     on = arm != BASELINE
     departed = departures(controller, arm, task) if on else {}
     return Identity(
+        algorithm=_algorithm(settings),
         task=task,
         noise=_noise(settings),
         arm=arm,
@@ -105,10 +109,17 @@ def identify(config: Mapping[str, Any]) -> Identity:
     )
 
 
-def default_text(key: str) -> str | None:
+def default_text(key: str, algorithm: str) -> str | None:
     """A key's default as :class:`Identity` writes values; ``None`` if the schema has none."""
-    defaults = {**schema_defaults(), _FILTER_KEYS[0]: DEFAULT_ALPHA}
+    schema = schema_defaults({"algorithm": "pets" if algorithm == "dets" else algorithm})
+    defaults = {**schema, _FILTER_KEYS[0]: DEFAULT_ALPHA}
     return _text(defaults[key]) if key in defaults else None
+
+
+def _algorithm(settings: Mapping[str, Any]) -> str:
+    name = str(settings["algorithm"])
+    points = settings.get("model.head") == "deterministic"
+    return "dets" if name == "pets" and points else name
 
 
 def _noise(settings: Mapping[str, Any]) -> str:

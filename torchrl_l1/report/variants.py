@@ -156,8 +156,11 @@ def _main_settings(
         }
     )
 
+    algorithm = runs[0].identity.algorithm
+
     def rank(combination: tuple[str, ...]) -> tuple[object, ...]:
-        defaults = sum(default_text(k) == v for k, v in zip(keys, combination, strict=True))
+        values = zip(keys, combination, strict=True)
+        defaults = sum(default_text(key, algorithm) == value for key, value in values)
         return -places[combination], -numbers[combination], -defaults, combination
 
     best = min(numbers, key=rank)
