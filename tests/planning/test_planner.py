@@ -220,10 +220,8 @@ def test_avoids_what_terminates_the_model(linear, ends):
 
 def test_the_plan_stays_where_nothing_is_finite():
     controller = make_controller()
-    broken = TrajectorySampler(
-        controller.sampler.dynamics, lambda x, u, successor: u[..., 0] * math.nan
-    )
-    controller.sampler = broken
+    with torch.no_grad():
+        controller.sampler.dynamics.network.biases[-1].fill_(math.nan)
     data = fresh(controller)
     data["plan", "step"] += 1
     data["plan", "mean"] += 0.25
@@ -237,6 +235,16 @@ def test_the_plan_stays_where_nothing_is_finite():
     out = controller(data)
     assert torch.isfinite(out["action"]).all()
     assert torch.isfinite(out["next", "plan", "best_return"])[:, 0].tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_reward_that_is_not_finite_is_named(value):
+    controller = make_controller()
+    controller.sampler = TrajectorySampler(
+        controller.sampler.dynamics, lambda x, u, successor: x[..., 0] + value
+    )
+    with pytest.raises(ValueError, match=f"the reward function gives {value} at the observation"):
+        controller(fresh(controller))
 
 
 def test_the_model_is_referred_to_and_seen_to_change():

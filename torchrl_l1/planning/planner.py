@@ -61,7 +61,8 @@ class ModelPredictiveController(TensorDictModuleBase):
 
     Raises:
         ValueError: for bounds that are empty or of the wrong width, ``replan_every`` outside the
-            horizon; at a call, for an observation or state of the wrong shape.
+            horizon; at a call, for an observation or state of the wrong shape, and for a reward that
+            is not finite where the system is.
         KeyError: at a call, if the observation or the planner's state is missing.
         TypeError: for another kind of settings.
 
@@ -159,6 +160,7 @@ class ModelPredictiveController(TensorDictModuleBase):
                 self.config,
                 self.generator,
             )
+            self._check_reward(flat[due], sequence[due, 0], planned.best_return)
             sequence = sequence.index_copy(0, due, planned.actions)
             best_return = best_return.index_copy(0, due, planned.best_return[:, None])
         following = {
@@ -179,6 +181,24 @@ class ModelPredictiveController(TensorDictModuleBase):
             ),
         )
         return tensordict
+
+    def _check_reward(self, observation: Tensor, action: Tensor, best_return: Tensor) -> None:
+        """Where no candidate has a finite return, find out whether the reward is to blame.
+
+        A model may diverge everywhere; then the plan stays what it was.
+        """
+        failed = torch.isneginf(best_return)
+        if not failed.any():
+            return
+        x, u = observation[failed], action[failed]
+        reward = self.sampler.reward(x, u, x)
+        bad = ~torch.isfinite(reward) & torch.isfinite(x).all(-1)
+        if bad.any():
+            raise ValueError(
+                "ModelPredictiveController: the reward function gives "
+                f"{reward[bad][0].item()} at the observation {x[bad][0].tolist()} with the action "
+                f"{u[bad][0].tolist()}; planning needs rewards that are finite"
+            )
 
     def _observation(self, tensordict: TensorDictBase) -> Tensor:
         observation = tensordict.get(self.observation_key, None)
