@@ -8,7 +8,14 @@ from pathlib import Path
 
 import torch
 
-from benchmarks import collection, env_stepping, jacobian
+from benchmarks import (
+    collection,
+    env_stepping,
+    fitting,
+    jacobian,
+    planning,
+    planning_precision,
+)
 from benchmarks.tables import Table
 
 RESULTS = Path(__file__).parent / "results"
@@ -19,6 +26,9 @@ BENCHMARKS: dict[str, tuple[int, int, Callable[[int], Table]]] = {
     "jacobian": (jacobian.THREADS, 21, jacobian.table),
     "env_stepping": (env_stepping.THREADS, 9, env_stepping.table),
     "collection": (collection.THREADS, 7, collection.table),
+    "planning": (planning.THREADS, 9, planning.table),
+    "planning_precision": (planning_precision.THREADS, 4, planning_precision.table),
+    "fitting": (fitting.THREADS, 9, fitting.table),
 }
 
 

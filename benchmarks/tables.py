@@ -22,7 +22,8 @@ class Table:
         name: stem of the files.
         title: heading.
         caption: what is measured, with its unit.
-        rows: measurements; a column ``x`` may come with ``x_low`` and ``x_high``.
+        rows: measurements; a column ``x`` may come with ``x_low`` and ``x_high``, and may be
+            missing from some rows.
         columns: columns to show, with their headings; ``rows`` may hold more.
         formats: format specification by column, ``.2f`` unless given.
     """
@@ -49,6 +50,8 @@ class Table:
         return "\n".join([*lines, ""])
 
     def _cell(self, row: Row, column: str) -> str:
+        if column not in row:
+            return ""
         value, form = row[column], self.formats.get(column, ".2f")
         if isinstance(value, str | int):
             return str(value)
@@ -61,7 +64,8 @@ class Table:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / f"{self.name}.md").write_text(f"{self.markdown()}\n*{machine()}*\n")
         with (folder / f"{self.name}.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(self.rows[0]))
+            names = dict.fromkeys(name for row in self.rows for name in row)
+            writer = csv.DictWriter(file, list(names))
             writer.writeheader()
             writer.writerows(self.rows)
 

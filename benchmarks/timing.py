@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
+from typing import TypeVar
 
 Row = dict[str, str | int | float]
 
+Case = TypeVar("Case", bound=Hashable)
+
 
 def interleave(
-    cases: Mapping[str, Callable[[], object]],
+    cases: Mapping[Case, Callable[[], object]],
     repetitions: int,
     *,
     shortest: float = 0.02,
     warmup: int = 2,
-) -> dict[str, list[float]]:
+) -> dict[Case, list[float]]:
     """Seconds per call of each case.
 
     Args:
@@ -32,7 +35,7 @@ def interleave(
         for _ in range(warmup):
             case()
         calls[name] = max(1, round(shortest / max(_seconds(case, 1), 1e-9)))
-    measured: dict[str, list[float]] = {name: [] for name in cases}
+    measured: dict[Case, list[float]] = {name: [] for name in cases}
     for _ in range(repetitions):
         for name, case in cases.items():
             measured[name].append(_seconds(case, calls[name]))

@@ -103,7 +103,9 @@ def test_derivatives_agree_with_forward_mode(
     torch.testing.assert_close(jacobian, expected, rtol=1e-10, atol=1e-10)
     step = (expected @ (other - u)[..., None])[..., 0]
     remainder = model.mean_change(x, other) - value - step
-    torch.testing.assert_close(model.taylor_remainder(x, u, other), remainder, rtol=0, atol=1e-8)
+    # A difference of numbers that the floored statistics may have made large.
+    atol = 1e-13 * max(1.0, value.abs().max().item(), step.abs().max().item())
+    torch.testing.assert_close(model.taylor_remainder(x, u, other), remainder, rtol=0, atol=atol)
 
 
 @given(

@@ -75,9 +75,11 @@ def fit_ensemble(
     device = next(dynamics.parameters()).device
     train, validation = (part.to(device) for part in _split(buffer, action_key))
     dynamics.train()
-    dynamics.fit_statistics(
-        train["observation"], train["action"], train["next", "observation"] - train["observation"]
-    )
+    change = train["next", "observation"] - train["observation"]
+    dynamics.fit_statistics(train["observation"], train["action"], change)
+    # Once for all batches: the statistics stay as they are.
+    inputs = dynamics.normalize_inputs(train["observation"], train["action"])
+    target = dynamics.change_normalizer.normalize(change)
     loss = EnsembleDynamicsLoss(dynamics)
     members, size = dynamics.members, train.shape[0]
     batch_size = min(config.batch_size, size)
@@ -95,18 +97,16 @@ def fit_ensemble(
             index = order[:, batch * batch_size : (batch + 1) * batch_size]
             if resample is not None:
                 index = resample.gather(1, index)
-            losses = loss(train[index])
-            objective = losses["loss_dynamics"]
-            running += losses["member_loss"].sum()
+            objective, member_loss = loss.objective(_rows(inputs, index), _rows(target, index))
+            running += member_loss.detach().sum()
             if config.weight_penalty:
                 objective = objective + config.weight_penalty * _penalty(dynamics) / size
-            if config.weight_decay:
-                objective = objective + _decay(dynamics, config.weight_decay)
             decay = 1 - (1 - config.final_learning_rate_fraction) * steps / planned
             for group in optimizer.param_groups:
                 group["lr"] = config.learning_rate * decay
             optimizer.zero_grad(set_to_none=True)
             objective.backward()
+            _add_decay(dynamics, config.weight_decay)
             optimizer.step()
             steps += 1
             if steps == config.max_gradient_steps:
@@ -150,13 +150,22 @@ def _check(config: FitConfig, dynamics: EnsembleDynamics) -> None:
         raise ValueError(f"fit.elites is {config.elites}, but the model has {members} members")
 
 
+def _rows(data: Tensor, index: Tensor) -> Tensor:
+    """Rows ``(E, B, width)`` of ``(N, width)`` at index ``(E, B)``."""
+    return data.index_select(0, index.flatten()).unflatten(0, index.shape)
+
+
 def _copy(parameters: Sequence[Tensor]) -> list[Tensor]:
     return [parameter.detach().clone() for parameter in parameters]
 
 
-def _decay(dynamics: EnsembleDynamics, coefficients: Sequence[float]) -> Tensor:
-    layers = zip(coefficients, dynamics.network.weights, strict=True)
-    return 0.5 * torch.stack([c * weight.square().sum() for c, weight in layers]).sum()
+@torch.no_grad()
+def _add_decay(dynamics: EnsembleDynamics, coefficients: Sequence[float]) -> None:
+    """Add the gradients of the squared weights, which are known without a backward pass."""
+    if coefficients:
+        for coefficient, weight in zip(coefficients, dynamics.network.weights, strict=True):
+            if weight.grad is not None:
+                weight.grad.add_(weight, alpha=coefficient)
 
 
 def _penalty(dynamics: EnsembleDynamics) -> Tensor:

@@ -126,15 +126,24 @@ class GaussianHead(Head):
         below = self.max_log_variance - softplus(self.max_log_variance - raw[..., self.dim :])
         return self.min_log_variance + softplus(below - self.min_log_variance)
 
+    def variance(self, raw: Tensor) -> Tensor:
+        r"""Predicted variance, ``(..., 2 dim)`` to ``(..., dim)``.
+
+        The exponential of :meth:`log_variance` without its logarithms, which are most of what
+        planning and fitting would spend here: :math:`e^\ell + e^h / (1 + e^{h - v})`.
+        """
+        share = torch.sigmoid(raw[..., self.dim :] - self.max_log_variance)
+        return share * self.max_log_variance.exp() + self.min_log_variance.exp()
+
     def standard_deviation(self, raw: Tensor) -> Tensor:
         """Predicted standard deviation, ``(..., 2 dim)`` to ``(..., dim)``."""
-        return (0.5 * self.log_variance(raw)).exp()
+        return self.variance(raw).sqrt()
 
     def loss(self, raw: Tensor, target: Tensor) -> Tensor:
         """Negative log-likelihood in nats, averaged over the target's columns."""
-        log_variance = self.log_variance(raw)
-        squared = (target - raw[..., : self.dim]).square() * (-log_variance).exp()
-        return 0.5 * (squared + log_variance + math.log(2 * math.pi)).mean(-1)
+        variance = self.variance(raw)
+        squared = (target - raw[..., : self.dim]).square() / variance
+        return 0.5 * ((squared + variance.log()).mean(-1) + math.log(2 * math.pi))
 
     def penalty(self) -> Tensor:
         """``bound_penalty`` times the sum of the distances between upper and lower bounds."""

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
+from itertools import accumulate
+from math import prod
 from typing import Any, Literal
 
 import torch
@@ -13,12 +16,16 @@ from torchrl_l1.dynamics import DeterministicHead, EnsembleDynamics
 
 Precision = Literal["auto", "float32", "bfloat16"]
 
-# In place: at the sizes of planning a fresh tensor costs as much as the activation.
-_ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
-    "relu": torch.relu_,
-    "tanh": torch.tanh_,
-    "silu": lambda z: nn.functional.silu(z, inplace=True),
+# In place: at the sizes of planning a fresh tensor costs as much as the activation. With each,
+# what it maps to one, in bfloat16 too.
+_ACTIVATIONS: dict[str, tuple[Callable[[Tensor], Tensor], float]] = {
+    "relu": (torch.relu_, 1.0),
+    "tanh": (torch.tanh_, 20.0),
+    "silu": (lambda z: nn.functional.silu(z, inplace=True), 1.2784645),
 }
+
+# Widths of hidden layers are filled up to multiples of this.
+_ALIGNMENT = 16
 
 
 def resolve_precision(
@@ -48,13 +55,15 @@ def resolve_precision(
 class PlanningNetwork:
     """Weights of an ensemble's elites, copied once per plan.
 
-    The products between hidden layers, nearly all of the work, run in the precision asked for;
-    input layer, output layer, statistics and states stay float32. The statistics of the inputs
-    are folded into the weights. Members are numbered by their place among the elites.
+    The products of hidden units, nearly all of the work, run in the precision asked for; input
+    layer, statistics and states stay float32. The statistics of the inputs are folded into the
+    weights. Each hidden layer has one more unit, which is always one: its weights are the biases
+    of the next layer. More units, always zero, fill the widths up to what processors like.
+    Members are numbered by their place among the elites.
 
     Attributes:
-        weights: per layer ``(k, in, out)``.
-        biases: per layer ``(k, out)``.
+        weights: per layer ``(k, in, out)``, widths filled up.
+        bias: of the first layer ``(k, out)``.
         observation_dim: number of observations, n.
         action_dim: number of actions, m.
         change_mean: of the change of state ``(n,)``, raw units.
@@ -67,13 +76,13 @@ class PlanningNetwork:
         >>> model = EnsembleDynamics(3, 1, members=2, hidden=(8, 8))
         >>> network = PlanningNetwork.from_dynamics(model, "bfloat16")
         >>> [weight.dtype for weight in network.weights]
-        [torch.float32, torch.bfloat16, torch.float32]
+        [torch.float32, torch.bfloat16, torch.bfloat16]
         >>> network.change(torch.zeros(5, 4), member=1).shape
         torch.Size([5, 3])
     """
 
     weights: list[Tensor]
-    biases: list[Tensor]
+    bias: Tensor
     observation_dim: int
     action_dim: int
     change_mean: Tensor
@@ -97,19 +106,26 @@ class PlanningNetwork:
         weights = [weight[elites].double() for weight in dynamics.network.weights]
         biases = [bias[elites, 0].double() for bias in dynamics.network.biases]
         _fold_inputs(dynamics, weights, biases)
-        # A layer's product is in the hidden precision if it reads and writes hidden units.
+        activation, one = _ACTIVATIONS[dynamics.network.activation]
+        _fold_biases(weights, biases, one)
+        # Between the layers of hidden units, and from the last to an output that is a small
+        # correction of the state. That of a control-affine model may be a difference of large ones.
         last = len(weights) - 1
-        dtypes = [hidden if 0 < layer < last else torch.float32 for layer in range(last + 1)]
+        affine = dynamics.network.weights[0].shape[1] == dynamics.observation_dim
+        low = range(1, last if affine else last + 1) if last > 1 else range(0)
         point = isinstance(dynamics.head, DeterministicHead)
         return cls(
-            weights=[weight.to(dtype) for weight, dtype in zip(weights, dtypes, strict=True)],
-            biases=[bias.to(dtype) for bias, dtype in zip(biases, dtypes, strict=True)],
+            weights=[
+                weight.to(hidden if layer in low else torch.float32)
+                for layer, weight in enumerate(weights)
+            ],
+            bias=biases[0].float(),
             observation_dim=dynamics.observation_dim,
             action_dim=dynamics.action_dim,
             change_mean=dynamics.change_normalizer.mean.to(torch.float32, copy=True),
             change_std=dynamics.change_normalizer.std.to(torch.float32, copy=True),
-            activation=_ACTIVATIONS[dynamics.network.activation],
-            standard_deviation=None if point else dynamics.head.standard_deviation,
+            activation=activation,
+            standard_deviation=None if point else deepcopy(dynamics.head).standard_deviation,
         )
 
     @property
@@ -119,34 +135,114 @@ class PlanningNetwork:
 
     def raw(self, inputs: Tensor, member: int) -> Tensor:
         """A member's raw output from observations and actions ``(B, n + m)``: ``(B, out)``."""
-        width = self.weights[0].shape[1]
-        z = inputs[:, :width]
-        last = len(self.weights) - 1
-        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            z = torch.addmm(bias[member], z.to(weight.dtype), weight[member])
-            if layer < last:
-                # The activation runs in the precision of the hidden layer that follows.
-                z = self.activation(z.to(self.weights[min(layer + 1, last - 1)].dtype))
-        if width == inputs.shape[1]:
-            return z
-        # A control-affine model: the network sees the observation and gives offset and gain.
-        rows = z.unflatten(1, (1 + self.action_dim, -1))
-        return rows[:, 0] + (rows[:, 1:] * inputs[:, width:, None]).sum(1)
+        rows = [0] * self.members
+        rows[member] = inputs.shape[0]
+        return ForwardPass(self, rows)(inputs)
 
     def change(self, inputs: Tensor, member: int) -> Tensor:
         """A member's mean prediction, normalised: ``(B, n + m)`` to ``(B, n)``."""
         return self.raw(inputs, member)[:, : self.observation_dim]
 
-    def sampled_change(
-        self, inputs: Tensor, member: int, generator: torch.Generator | None = None
-    ) -> Tensor:
-        """A draw from a member's prediction, normalised: ``(B, n + m)`` to ``(B, n)``."""
-        raw = self.raw(inputs, member)
+    def sample(self, raw: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """A draw from the predictions that raw outputs stand for: ``(B, out)`` to ``(B, n)``."""
         mean = raw[:, : self.observation_dim]
         if self.standard_deviation is None:
             return mean
-        noise = torch.randn(mean.shape, generator=generator, device=mean.device)
+        noise = torch.randn(mean.shape[::-1], generator=generator, device=mean.device).t()
         return torch.addcmul(mean, noise, self.standard_deviation(raw))
+
+
+class ForwardPass:
+    """Raw outputs of a network for rows that are sorted by member, again and again.
+
+    Member by member through all layers, so that its hidden units stay in the cache. They are in
+    the same memory each time (fresh tensors would soon have been everywhere in that cache), and
+    what does not depend on the inputs is prepared once.
+
+    Args:
+        network: the network.
+        rows: number of rows of each member, in turn.
+        shared: whether the members read the same rows, all of the input, instead of their own.
+        memory: where to keep hidden units; passes that are not used at once may share it.
+    """
+
+    def __init__(
+        self,
+        network: PlanningNetwork,
+        rows: Sequence[int],
+        shared: bool = False,
+        memory: dict[tuple[torch.dtype, int], Tensor] | None = None,
+    ) -> None:
+        memory = {} if memory is None else memory
+        self._network, self._copies = network, len(rows) if shared else 1
+        self._width = network.weights[0].shape[1]
+        last = network.weights[-1]
+        # Column by column in memory: it is columns that are worked on from here.
+        self._out = last.new_empty(last.shape[2], sum(rows)).t()
+        self._members: list[tuple[int, int, Tensor, list[_Layer]]] = []
+        for member, end in enumerate(accumulate(rows)):
+            if count := rows[member]:
+                out = self._out[end - count : end]
+                layers = _layers(network, member, out, memory)
+                start = 0 if shared else end - count
+                self._members.append((start, start + count, network.bias[member], layers))
+
+    def __call__(self, inputs: Tensor) -> Tensor:
+        """Raw outputs ``(sum of rows, out)``, float32, valid until the next call.
+
+        Args:
+            inputs: observations and actions ``(B, n + m)``.
+        """
+        read, activation = inputs[:, : self._width], self._network.activation
+        for start, end, bias, layers in self._members:
+            _, _, weight, out = layers[0]
+            torch.addmm(bias, read[start:end], weight, out=out)
+            for units, operand, weight, out in layers[1:]:
+                activation(units)
+                if operand is not units:
+                    operand.copy_(units)
+                torch.mm(operand, weight, out=out)
+        raw = self._out.float()
+        if self._width == inputs.shape[1]:
+            return raw
+        # A control-affine model: the network sees the observation and gives offset and gain.
+        action = inputs[:, self._width :].repeat(self._copies, 1)
+        parts = raw.unflatten(1, (1 + action.shape[1], -1))
+        return parts[:, 0] + (parts[:, 1:] * action[:, :, None]).sum(1)
+
+
+_Layer = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+def _layers(
+    network: PlanningNetwork,
+    member: int,
+    out: Tensor,
+    memory: dict[tuple[torch.dtype, int], Tensor],
+) -> list[_Layer]:
+    """Units read, the same in the precision of the weight, the weight, and where to write."""
+    layers: list[_Layer] = []
+    units = out  # the first layer reads inputs that are not known yet
+    for layer, weights in enumerate(network.weights):
+        weight, before, operand = weights[member], units, units
+        if layer and before.dtype != weight.dtype:
+            operand = _part(memory, weight, before.shape, 2)
+        units = out
+        if layer < len(network.weights) - 1:
+            units = _part(memory, weight, (out.shape[0], weight.shape[1]), layer % 2)
+        layers.append((before, operand, weight, units))
+    return layers
+
+
+def _part(
+    memory: dict[tuple[torch.dtype, int], Tensor], like: Tensor, shape: Sequence[int], slot: int
+) -> Tensor:
+    """Uninitialised tensor in a slot of the memory, which grows where it must."""
+    size = prod(shape)
+    found = memory.get((like.dtype, slot))
+    if found is None or found.numel() < size:
+        found = memory[like.dtype, slot] = like.new_empty(size)
+    return found[:size].view(*shape)
 
 
 def _fold_inputs(dynamics: EnsembleDynamics, weights: list[Tensor], biases: list[Tensor]) -> None:
@@ -165,3 +261,26 @@ def _fold_inputs(dynamics: EnsembleDynamics, weights: list[Tensor], biases: list
         gain = rows[..., 1:, :] / action.std.double()[:, None]
         offset = rows[..., :1, :] - (action.mean.double()[:, None] * gain).sum(-2, keepdim=True)
         layers[-1] = torch.cat([offset, gain], -2).flatten(-2)
+
+
+def _fold_biases(weights: list[Tensor], biases: list[Tensor], one: float) -> None:
+    """Change the weights, in place, to those of layers with a unit that is always one.
+
+    ``one`` is what the activation maps to one. The first layer's bias remains.
+    """
+    last = len(weights) - 1
+    for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        members, before, after = weight.shape
+        rows = before if layer == 0 else weights[layer - 1].shape[2]
+        columns = after if layer == last else -(-(after + 1) // _ALIGNMENT) * _ALIGNMENT
+        filled = weight.new_zeros(members, rows, columns)
+        filled[:, :before, :after] = weight
+        constant = weight.new_zeros(members, columns)
+        constant[:, :after] = bias
+        if layer < last:
+            constant[:, after] = one
+        if layer == 0:
+            biases[0] = constant
+        else:
+            filled[:, before] = constant
+        weights[layer] = filled

@@ -61,8 +61,8 @@ class ModelPredictiveController(TensorDictModuleBase):
 
     Raises:
         ValueError: for bounds that are empty or of the wrong width, ``replan_every`` outside the
-            horizon; at a call, for an observation or state of the wrong shape, and for a reward that
-            is not finite where the system is.
+            horizon; at a call, for an observation or state of the wrong shape, and for a reward
+            that is not finite where the system is.
         KeyError: at a call, if the observation or the planner's state is missing.
         TypeError: for another kind of settings.
 

@@ -11,16 +11,21 @@ import torch
 from torch import Tensor
 
 from torchrl_l1.dynamics import EnsembleDynamics
-from torchrl_l1.planning.network import PlanningNetwork, Precision, resolve_precision
+from torchrl_l1.planning.network import (
+    ForwardPass,
+    PlanningNetwork,
+    Precision,
+    resolve_precision,
+)
 from torchrl_l1.planning.sequences import Evaluate
 
 Propagation = Literal["ts1", "tsinf", "mean"]
 RewardFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 Termination = Callable[[Tensor], Tensor]
 
-# Trajectories per member whose activations, at a few hundred units, stay in the cores' caches for
-# the whole horizon together with that member's weights. Elsewhere it only bounds the memory.
-_CPU_BLOCK = 1600
+# Trajectories that go through the horizon together: enough of them to make little of what a call
+# costs, and no more than a processor's caches hold. Elsewhere it only bounds the memory.
+_CPU_BLOCK = 8000
 _OTHER_BLOCK = 131_072
 
 _Predict = Callable[[Tensor, int], Tensor]
@@ -99,22 +104,21 @@ def evaluate(
     total = torch.zeros(count, device=sequences.device)
     if block is None:
         block = _CPU_BLOCK if sequences.device.type == "cpu" else _OTHER_BLOCK
-        if propagation == "ts1":
-            block *= network.members
-    groups = _groups(network, particles, propagation)
-    # Member by member, so that only one member's weights compete for the cache with the block.
-    for member, share in groups:
-        blocks = ceil(count * share / block)
-        size = max(1, ceil(count / blocks))
-        for first in range(0, count, size):
-            plans = sequences[first : first + size]
-            owner = torch.arange(first, first + plans.shape[0], device=plans.device)
-            x = start[owner // actions.shape[1]].repeat_interleave(share, 0)
-            u = plans.transpose(0, 1).repeat_interleave(share, 1)
-            predict = _predictor(network, propagation, member, x.shape[0], horizon, generator)
-            returns = _rollout(network, predict, x, u, reward, terminated)
-            total[first : first + size] += returns.reshape(-1, share).sum(1)
-    mean = total / sum(share for _, share in groups)
+    shares = _shares(network, particles, propagation)
+    rows = network.members if propagation == "mean" else sum(shares)
+    blocks = ceil(count * rows / block)
+    size = max(1, ceil(count / blocks))
+    for first in range(0, count, size):
+        plans = sequences[first : first + size]
+        own = torch.arange(plans.shape[0], device=plans.device)
+        # Sorted by member, then by candidate.
+        plan = torch.cat([own.repeat_interleave(share) for share in shares])
+        x = start[(first + plan) // actions.shape[1]]
+        u = plans.permute(1, 2, 0)[..., plan].transpose(1, 2)
+        predict = _predictor(network, propagation, shares, plan, horizon, generator)
+        returns = _rollout(network, predict, x, u, reward, terminated)
+        total[first : first + size].index_add_(0, plan, returns)
+    mean = total / sum(shares)
     return torch.where(torch.isfinite(mean), mean, -torch.inf).reshape(actions.shape[:2])
 
 
@@ -201,50 +205,45 @@ def _check_shapes(network: PlanningNetwork, observation: Tensor, actions: Tensor
         raise ValueError(f"there is nothing to evaluate in actions of shape {tuple(actions.shape)}")
 
 
-def _groups(
-    network: PlanningNetwork, particles: int, propagation: Propagation
-) -> list[tuple[int, int]]:
-    """Pairs of a member and its number of particles; without meaning unless it is kept."""
-    if propagation == "mean":
-        return [(0, 1)]
-    if propagation == "ts1":
-        return [(0, particles)]
-    k = network.members
-    return [(member, len(range(member, particles, k))) for member in range(min(k, particles))]
+def _shares(network: PlanningNetwork, particles: int, propagation: Propagation) -> list[int]:
+    """Particles of each member; of no member in particular unless it is kept."""
+    if propagation == "tsinf":
+        return [len(range(member, particles, network.members)) for member in range(network.members)]
+    return [1 if propagation == "mean" else particles]
 
 
 def _predictor(
     network: PlanningNetwork,
     propagation: Propagation,
-    member: int,
-    rows: int,
+    shares: list[int],
+    plan: Tensor,
     horizon: int,
     generator: torch.Generator | None,
 ) -> _Predict:
-    """Normalised change ``(rows, n)`` from raw inputs ``(rows, n + m)`` at a step."""
-    k = network.members
+    """Normalised change ``(B, n)`` from raw inputs ``(B, n + m)`` at a step."""
+    k, count = network.members, plan.shape[0]
     if propagation == "mean":
+        everyone = ForwardPass(network, [count] * k, shared=True)
 
         def mean(inputs: Tensor, step: int) -> Tensor:
-            change = network.change(inputs, 0).clone()
-            for other in range(1, k):
-                change += network.change(inputs, other)
-            return change.div_(k)
+            changes = everyone(inputs)[:, : network.observation_dim]
+            return changes.unflatten(0, (k, count)).mean(0)
 
         return mean
-    if propagation == "tsinf" or k == 1:
-        return lambda inputs, step: network.sampled_change(inputs, member, generator)
-    device = network.change_mean.device
-    drawn = torch.randint(k, (horizon, rows), generator=generator, device=device)
+    if propagation == "tsinf":
+        candidates = count // sum(shares)
+        keeping = ForwardPass(network, [candidates * share for share in shares])
+        return lambda inputs, step: network.sample(keeping(inputs), generator)
+    drawn = torch.randint(k, (horizon, count), generator=generator, device=plan.device)
     order = drawn.argsort(1)
-    sizes = torch.stack([(drawn == other).sum(1) for other in range(k)], 1).tolist()
+    sizes = torch.stack([(drawn == member).sum(1) for member in range(k)], 1).tolist()
+    memory: dict[tuple[torch.dtype, int], Tensor] = {}
 
     def switching(inputs: Tensor, step: int) -> Tensor:
-        # Rows of the same member next to each other, one product for each.
-        parts = inputs[order[step]].split(sizes[step])
-        changes = [network.sampled_change(part, j, generator) for j, part in enumerate(parts)]
+        # Rows of the same member next to each other, for as long as the products take.
+        raw = ForwardPass(network, sizes[step], memory=memory)(inputs[order[step]])
         result = torch.empty_like(inputs[:, : network.observation_dim])
-        result[order[step]] = torch.cat(changes)
+        result[order[step]] = network.sample(raw, generator)
         return result
 
     return switching
@@ -260,7 +259,8 @@ def _rollout(
 ) -> Tensor:
     """Returns ``(B,)`` of trajectories from ``(B, n)`` under actions ``(H, B, m)``."""
     horizon, n = u.shape[0], x.shape[1]
-    inputs = x.new_empty(horizon + 1, x.shape[0], n + u.shape[2])
+    # Column by column in memory: all that is done to a state is then done to whole columns.
+    inputs = x.new_empty(horizon + 1, n + u.shape[2], x.shape[0]).transpose(1, 2)
     states = inputs[..., :n]
     states[0] = x
     inputs[:-1, :, n:] = u
