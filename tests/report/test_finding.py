@@ -22,7 +22,12 @@ def test_identity_comes_from_the_configuration(write_run: WriteRun, tmp_path: Pa
         write_run([1], "l1=reference", "l1.cutoff=1"): ("none", "reference"),
         write_run([1], "l1=paper", "l1.epsilon=7"): ("none", "paper"),
         write_run([1], "l1=paper", "l1.on_switch=reset"): ("none", "paper"),
-        write_run([1], "perturbation.action_noise=0.3"): ("action 0.3, observation 0", "paper"),
+        write_run([1], "perturbation.action_noise=0.3"): ("action 0.3", "paper"),
+        write_run([1], "perturbation.observation_noise=0.05"): ("observation 0.05", "paper"),
+        write_run([1], "noise=action", "perturbation.observation_noise=1"): (
+            "action 0.1, observation 1",
+            "paper",
+        ),
     }
     runs = {run.path: run.identity for run in find_runs([tmp_path])}
     assert {path: (what.noise, what.arm) for path, what in runs.items()} == expected

@@ -114,7 +114,7 @@ def test_whatever_was_run_a_task_has_a_main_cell(runs: list[tuple[int, int, int,
         name = ("off", "paper", "reference")[arm]
         l1 = {} if arm == 0 else {"l1.epsilon": str(epsilon)}
         identity = Identity(
-            "swimmer", str(noise), name, seed, 1, {"label": str(label)}, l1, {}, name
+            "metrpo", "swimmer", str(noise), name, seed, 1, {"label": str(label)}, l1, {}, name
         )
         empty = np.empty(0)
         made.append(Run(Path(str(seed)), identity, empty, empty, empty, {}, empty))

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from torchrl_l1.experiment.run_directory import write_atomically
+from torchrl_l1.report.algorithm_sections import algorithm_sections
 from torchrl_l1.report.campaigns import find_campaigns
 from torchrl_l1.report.evaluation_sections import evaluation_sections
 from torchrl_l1.report.finding import Findings, find_readable_runs
@@ -13,7 +15,7 @@ from torchrl_l1.report.page import Page
 from torchrl_l1.report.reference_curves import ReferenceCurves
 from torchrl_l1.report.training_sections import training_sections
 from torchrl_l1.report.training_tables import run_rows
-from torchrl_l1.report.variants import Study
+from torchrl_l1.report.variants import Study, studies
 
 __all__ = ["report"]
 
@@ -22,6 +24,9 @@ def report(
     folders: Sequence[Path], output: Path | None = None, reference_curves: Path | None = None
 ) -> Path:
     """Write tables, figures and a page of all runs in or below some folders.
+
+    Each algorithm has sections of its own. Where there are several, their headings and files are
+    named after it, and a last section compares them.
 
     Everything is read before anything is written. Files that cannot be read are left out, and
     the page lists them.
@@ -48,14 +53,17 @@ def report(
     found = find_readable_runs(folders)
     runs = found.runs
     campaigns = find_campaigns(folders, runs)
-    study = Study(runs)
+    every = studies(runs)
     output.mkdir(parents=True, exist_ok=True)
 
     page = Page(output)
-    _introduction(page, study, found, _command(folders, output, reference_curves))
+    _introduction(page, every, found, _command(folders, output, reference_curves))
     page.campaigns(campaigns)
-    training_sections(page, study, reference)
-    evaluation_sections(page, study)
+    for study in every:
+        part = page.part(study.facts.name) if len(every) > 1 else page
+        training_sections(part, study, reference)
+        evaluation_sections(part, study)
+    algorithm_sections(page, every)
     page.heading("Versions", "What the runs ran with, from their `versions.json`.")
     page.versions(runs)
     file = output / "report.md"
@@ -63,17 +71,20 @@ def report(
     return file
 
 
-def _introduction(page: Page, study: Study, found: Findings, command: str) -> None:
-    unfinished = sum(not run.finished for run in study.runs)
+def _introduction(page: Page, every: Sequence[Study], found: Findings, command: str) -> None:
+    runs = [run for study in every for run in study.runs]
+    unfinished = sum(not run.finished for run in runs)
     page.text(
-        f"{len(study.runs)} runs, of which {len(study.runs) - unfinished} are finished; only "
+        f"{len(runs)} runs, of which {len(runs) - unfinished} are finished; only "
         "these enter means, intervals and differences. Every run's settings are in the "
         "`config.yaml` of its directory.",
         f"```console\n$ {command}\n```",
     )
-    page.csv("runs", run_rows(study))
-    if study.duplicates:
-        left_out = "\n".join(f"- {run.path}" for run in study.duplicates)
+    page.text(_algorithms(every))
+    page.csv("runs", _run_rows(every))
+    duplicates = [run for study in every for run in study.duplicates]
+    if duplicates:
+        left_out = "\n".join(f"- {run.path}" for run in duplicates)
         page.text(
             "Left out, since another run has the same settings and seed (what it was evaluated in "
             f"and the other was not counts for the other):\n\n{left_out}"
@@ -81,6 +92,24 @@ def _introduction(page: Page, study: Study, found: Findings, command: str) -> No
     if found.errors:
         errors = "\n".join(f"- {error}" for error in found.errors)
         page.text(f"Left out, since they cannot be read:\n\n{errors}")
+
+
+def _algorithms(every: Sequence[Study]) -> str:
+    """Which algorithms there are; nothing to say where it is the published one alone."""
+    if len(every) == 1:
+        algorithm = every[0].facts
+        return "" if algorithm.published else f"The algorithm is {algorithm.name}."
+    numbers = ", ".join(f"{study.facts.name} ({len(study.runs)} runs)" for study in every)
+    return (
+        f"Algorithms: {numbers}. Their runs are never pooled: each has sections of its own, with "
+        "its name in the headings, and tables and figures are named after it."
+    )
+
+
+def _run_rows(every: Sequence[Study]) -> list[dict[str, Any]]:
+    if len(every) == 1:
+        return run_rows(every[0])
+    return [{"algorithm": study.facts.name, **row} for study in every for row in run_rows(study)]
 
 
 def _command(folders: Sequence[Path], output: Path, reference_curves: Path | None) -> str:

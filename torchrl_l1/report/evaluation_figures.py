@@ -10,7 +10,16 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from torchrl_l1.report.evaluation_tables import PHASES
-from torchrl_l1.report.style import arm_label, color, fit_scale, grid, legend_below, save, title
+from torchrl_l1.report.style import (
+    arm_label,
+    color,
+    fit_scale,
+    grid,
+    legend_below,
+    named,
+    save,
+    title,
+)
 from torchrl_l1.report.variants import noise_order
 
 __all__ = ["plot_ablation", "plot_disturbances"]
@@ -18,13 +27,14 @@ __all__ = ["plot_ablation", "plot_disturbances"]
 Row = Mapping[str, Any]
 
 
-def plot_ablation(rows: Sequence[Row], file: Path) -> Path:
+def plot_ablation(rows: Sequence[Row], file: Path, name: str = "") -> Path:
     """Bars of return with L1 in neither phase, one of them, or both; a panel per task.
 
     Args:
         rows: of :func:`~torchrl_l1.report.evaluation_tables.ablation_rows`, of one kind of policy,
             one kind of L1 and one variant.
         file: where to.
+        name: of the algorithm, where there are several.
     """
     tasks = list(dict.fromkeys(row["task"] for row in rows))
     figure, axes = grid(len(tasks), columns=2, width=6.2, height=3.6)
@@ -40,7 +50,7 @@ def plot_ablation(rows: Sequence[Row], file: Path) -> Path:
         axis.set_xticks(range(len(noises)), [f"noise: {noise}" for noise in noises])
         axis.set_xlim(-0.6, len(noises) - 0.4)
         axis.set_ylabel("return (sum of rewards)")
-        axis.set_title(title(task), fontsize=10)
+        axis.set_title(named(name, title(task)), fontsize=10)
         axis.grid(axis="y", alpha=0.3)
     legend_below(figure, axes)
     return save(figure, file)
@@ -58,7 +68,9 @@ def _bar(axis: Axes, x: float, row: Row, shade: str) -> None:
         axis.vlines(x, row["return_low"], row["return_high"], color="black", linewidth=1.4)
 
 
-def plot_disturbances(rows: Sequence[Row], heading: str, file: Path) -> Path | None:
+def plot_disturbances(
+    rows: Sequence[Row], heading: str, file: Path, policies: Mapping[str, str]
+) -> Path | None:
     """Return against actuator bias and against actuator gain, and what L1 adds to it.
 
     The band of a return is the 95 % interval of the mean over training seeds. These differ more
@@ -69,6 +81,7 @@ def plot_disturbances(rows: Sequence[Row], heading: str, file: Path) -> Path | N
         rows: of one training cell, tested under several biases and gains.
         heading: title of the figure.
         file: where to.
+        policies: the kinds of policies in words.
 
     Returns:
         the file, or ``None`` if neither bias nor gain varies.
@@ -82,7 +95,7 @@ def plot_disturbances(rows: Sequence[Row], heading: str, file: Path) -> Path | N
                 if (row["policy"], row["noise"], row[other]) == (policy, noise, neutral)
             ]
             if len({row[what] for row in chosen}) > 1:
-                found.append((_panel_title(policy, noise), what, chosen))
+                found.append((_panel_title(policies[policy], noise), what, chosen))
     if not found:
         return None
     # All panels of a column vary the same; returns and differences take turns down the rows.
@@ -109,10 +122,9 @@ def plot_disturbances(rows: Sequence[Row], heading: str, file: Path) -> Path | N
     return save(figure, file)
 
 
-def _panel_title(policy: str, noise: str) -> str:
-    actions = {"stochastic": "sampled actions", "deterministic": "mean action"}
-    name = actions.get(policy, policy)
-    return name if noise == "none" else f"{name}, noise: {noise}"
+def _panel_title(actions: str, noise: str) -> str:
+    noises = "" if noise == "none" else f"noise: {noise}"
+    return ", ".join(filter(None, (actions, noises)))
 
 
 def _draw_disturbance(

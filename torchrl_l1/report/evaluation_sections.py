@@ -5,28 +5,28 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+from torchrl_l1.report.algorithms import AlgorithmFacts
 from torchrl_l1.report.evaluation_figures import plot_ablation, plot_disturbances
 from torchrl_l1.report.evaluation_tables import ablation_rows, evaluation_names, evaluation_rows
-from torchrl_l1.report.page import Page, slug
+from torchrl_l1.report.page import Page
 from torchrl_l1.report.rendering import ablation_table, evaluation_table
 from torchrl_l1.report.settings import BASELINE
-from torchrl_l1.report.style import arm_label, noise_words, title
+from torchrl_l1.report.style import arm_label, named, noise_words, title
 from torchrl_l1.report.tuning_figures import plot_tuning, tuning_rows
 from torchrl_l1.report.variants import Study
 
 __all__ = ["evaluation_sections"]
 
 Row = Mapping[str, Any]
+Section = Callable[[Page, AlgorithmFacts, Sequence[Row]], None]
 
 # Longer tables are left to their CSV.
 _MOST_ROWS = 160
 
-_ACTIONS = {"stochastic": "sampled actions", "deterministic": "mean action"}
-
 
 def evaluation_sections(page: Page, study: Study) -> None:
     """A section per evaluation: those of the paper first, then the user's own."""
-    special: dict[str, Callable[[Page, Sequence[Row]], None]] = {
+    special: dict[str, Section] = {
         "sim_to_real": _sim_to_real,
         "ablation": _ablation,
         "disturbances": _disturbances,
@@ -36,42 +36,44 @@ def evaluation_sections(page: Page, study: Study) -> None:
         if name == "ablation":
             rows = ablation_rows(rows)
         if rows:
-            special.get(name, _other(name))(page, rows)
-            _tuning(page, name, rows)
+            special.get(name, _other(name))(page, study.facts, rows)
+            _tuning(page, study.facts, name, rows)
             page.csv(name, rows)
 
 
-def _sim_to_real(page: Page, rows: Sequence[Row]) -> None:
+def _sim_to_real(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> None:
     page.heading(
         "Sim to real",
-        "Policies and models trained without noise, frozen and tested with it, L1 off and on "
-        "(the paper's Table 2): mean ± standard deviation over training seeds, 95 % interval of "
+        "Policies and models trained without noise, frozen and tested with it, L1 off and on"
+        + " (the paper's Table 2)" * algorithm.published
+        + ": mean ± standard deviation over training seeds, 95 % interval of "
         "the mean; differences are taken policy by policy.",
     )
-    _evaluation_tables(page, rows)
+    _evaluation_tables(page, algorithm, rows)
 
 
-def _ablation(page: Page, rows: Sequence[Row]) -> None:
+def _ablation(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> None:
     page.heading(
         "Ablation",
-        "L1 in neither phase, in one of them, or in both (the paper's Table 5 and ablation "
-        "figure): bars are means, dots training seeds, lines 95 % intervals.",
+        "L1 in neither phase, in one of them, or in both"
+        + " (the paper's Table 5 and ablation figure)" * algorithm.published
+        + ": bars are means, dots training seeds, lines 95 % intervals.",
     )
     for l1 in sorted({row["training_l1"] for row in rows} - {BASELINE}):
         mine = [row for row in rows if {row["training_l1"], row["l1"]} <= {BASELINE, l1}]
-        for policy, actions in _ACTIONS.items():
+        for policy, actions in algorithm.policies.items():
             chosen = [row for row in mine if row["policy"] == policy]
             if chosen:
-                page.text(f"L1 {l1}, {actions}:", ablation_table(chosen))
+                page.text(f"{_listed(f'L1 {l1}', actions)}:", ablation_table(chosen))
         for variant in dict.fromkeys(row["variant"] for row in mine):
             chosen = [r for r in mine if (r["variant"], r["policy"]) == (variant, "stochastic")]
             if chosen:
-                file = page.folder / f"ablation_{slug((l1, variant))}.png"
-                caption = ", ".join(filter(None, (f"Ablation, L1 {l1}", variant)))
-                page.figure(plot_ablation(chosen, file), caption)
+                file = page.file("ablation", l1, variant)
+                caption = _listed(f"Ablation, L1 {l1}", variant)
+                page.figure(plot_ablation(chosen, file, page.name), caption)
 
 
-def _disturbances(page: Page, rows: Sequence[Row]) -> None:
+def _disturbances(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> None:
     page.heading(
         "Disturbances",
         "Return of frozen policies against an actuator bias and an actuator gain that the model "
@@ -79,18 +81,20 @@ def _disturbances(page: Page, rows: Sequence[Row]) -> None:
         "difference to the same policies without L1 with the interval of its mean.",
     )
     for heading, words, chosen in _training_cells(rows):
-        file = page.folder / f"disturbances_{slug(words)}.png"
-        page.figure(plot_disturbances(chosen, heading, file), heading)
+        file = page.file("disturbances", *words)
+        drawn = plot_disturbances(chosen, named(page.name, heading), file, algorithm.policies)
+        page.figure(drawn, heading)
 
 
-def _tuning(page: Page, name: str, rows: Sequence[Row]) -> None:
+def _tuning(page: Page, algorithm: AlgorithmFacts, name: str, rows: Sequence[Row]) -> None:
     """A figure per training cell, where the tests go through values of the controller."""
     explained = False
     for heading, words, chosen in _training_cells(rows):
         policy, swept = tuning_rows(chosen)
-        caption = f"{heading}; tested with {'the ' * (policy == 'deterministic')}{_ACTIONS[policy]}"
-        file = page.folder / f"sweep_{slug((name, *words))}.png"
-        drawn = plot_tuning(swept, caption, file)
+        actions = f"{'the ' * (policy == 'deterministic')}{algorithm.policies[policy]}"
+        caption = f"{heading}; tested with {actions}" if actions else heading
+        file = page.file("sweep", name, *words)
+        drawn = plot_tuning(swept, named(page.name, caption), file)
         if drawn is not None and not explained:
             page.text(
                 "Switches and returns against the values of the controller that the tests set: "
@@ -111,22 +115,27 @@ def _training_cells(rows: Sequence[Row]) -> Iterator[tuple[str, tuple[str, ...],
         yield heading, cell, [row for row in rows if tuple(row[key] for key in cells) == cell]
 
 
-def _other(name: str) -> Callable[[Page, Sequence[Row]], None]:
-    def section(page: Page, rows: Sequence[Row]) -> None:
+def _other(name: str) -> Section:
+    def section(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> None:
         page.heading(
             f"Evaluation `{name}`",
             "Frozen policies under its conditions: mean ± standard deviation over training "
             "seeds, 95 % interval of the mean; differences are taken policy by policy.",
         )
-        _evaluation_tables(page, rows)
+        _evaluation_tables(page, algorithm, rows)
 
     return section
 
 
-def _evaluation_tables(page: Page, rows: Sequence[Row]) -> None:
+def _evaluation_tables(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> None:
     """A table per L1 setting of the training and kind of policy."""
     for l1 in dict.fromkeys(row["training_l1"] for row in rows):
-        for policy, actions in _ACTIONS.items():
+        for policy, actions in algorithm.policies.items():
             chosen = [r for r in rows if (r["training_l1"], r["policy"]) == (l1, policy)]
             if chosen and len(chosen) <= _MOST_ROWS:
-                page.text(f"Trained with {arm_label(l1)}, {actions}:", evaluation_table(chosen))
+                words = _listed(f"Trained with {arm_label(l1)}", actions)
+                page.text(f"{words}:", evaluation_table(chosen))
+
+
+def _listed(*words: str) -> str:
+    return ", ".join(filter(None, words))

@@ -136,10 +136,7 @@ def _against_baseline(
 def _published(run: Run, key: Key) -> dict[str, str]:
     l1, noise, bias, gain, policy = key
     what = run.identity
-    if (bias, gain, policy) != (0.0, 1.0, "stochastic") or what.model_form == "affine":
-        return {}
-    if what.departures:
-        # The paper's L1 is the shipped one.
+    if (bias, gain, policy) != (0.0, 1.0, "stochastic") or not what.as_published:
         return {}
     cell = published_cell(what.task, what.noise, what.arm, noise, l1)
     return {} if cell is None else cell.columns()

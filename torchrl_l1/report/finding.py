@@ -12,9 +12,10 @@ import numpy as np
 
 from torchrl_l1.experiment.finding import run_directories
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
+from torchrl_l1.report.algorithms import facts
 from torchrl_l1.report.reading import (
     SIGNALS,
-    TRAINING_PHASES,
+    one_policy,
     read_evaluations,
     read_metrics,
     read_seconds,
@@ -90,6 +91,7 @@ def find_readable_runs(folders: Sequence[Path]) -> Findings:
 def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirectoryError]) -> Run:
     try:
         identity = identify(config)
+        algorithm = facts(identity.algorithm)
     except (KeyError, TypeError, ValueError) as error:
         raise RunDirectoryError(f"cannot use {directory.config_file}: {error}") from error
     columns = read_metrics(directory.metrics_file)
@@ -120,9 +122,13 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
         columns["return_deterministic"],
         {name: columns[name] for name in SIGNALS},
         readable(
-            partial(read_seconds, directory.timing_file, iterations),
-            {phase: np.full(iterations, np.nan) for phase in TRAINING_PHASES},
+            partial(read_seconds, directory.timing_file, iterations, algorithm.phases),
+            {phase: np.full(iterations, np.nan) for phase in algorithm.phases},
         ),
         readable(partial(read_versions, path / "versions.json"), {}),
-        {name: tests for name, tests in evaluations.items() if tests},
+        {
+            name: tests if algorithm.samples else one_policy(tests)
+            for name, tests in evaluations.items()
+            if tests
+        },
     )

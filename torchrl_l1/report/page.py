@@ -10,6 +10,7 @@ from typing import Any
 from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.report.campaigns import CampaignState
 from torchrl_l1.report.runs import Run
+from torchrl_l1.report.style import named
 from torchrl_l1.report.tables import markdown
 
 __all__ = ["Page", "slug"]
@@ -22,15 +23,33 @@ class Page:
 
     Args:
         folder: where everything goes; must exist.
+
+    Attributes:
+        name: of the part that this is, see :meth:`part`; empty for the page itself.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self.name = ""
         self._blocks: list[str] = ["# Report"]
+
+    def part(self, name: str) -> Page:
+        """The same page, to be continued under a name.
+
+        Args:
+            name: comes first in headings, captions and names of files; nothing does if empty.
+        """
+        part = Page(self.folder)
+        part.name, part._blocks = name, self._blocks
+        return part
+
+    def file(self, *words: str, suffix: str = ".png") -> Path:
+        """Where a file of this part goes."""
+        return self.folder / f"{slug((self.name, *words))}{suffix}"
 
     def heading(self, text: str, how_to_read: str) -> None:
         """Begin a section with a sentence on how to read it."""
-        self.text(f"## {text}")
+        self.text(f"## {named(self.name, text)}")
         self.text(how_to_read)
 
     def text(self, *blocks: str) -> None:
@@ -39,14 +58,15 @@ class Page:
 
     def csv(self, name: str, rows: Sequence[Row]) -> None:
         """Write a table in full precision and name it."""
-        file = self.folder / f"{name}.csv"
+        prefix = f"{slug((self.name,))}_" if self.name else ""
+        file = self.folder / f"{prefix}{name}.csv"
         write_table(file, rows)
         self.text(f"All columns: [{file.name}](./{file.name}).")
 
     def figure(self, file: Path | None, caption: str) -> None:
         """Show a figure; nothing if there was nothing to draw."""
         if file is not None:
-            self.text(f"![{caption}]({file.name})")
+            self.text(f"![{named(self.name, caption)}]({file.name})")
 
     def campaigns(self, campaigns: Sequence[CampaignState]) -> None:
         """How far each campaign is, and the command behind it."""

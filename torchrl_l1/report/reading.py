@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,8 @@ from torchrl_l1.report.numeric_csv import numeric_rows
 
 __all__ = [
     "SIGNALS",
-    "TRAINING_PHASES",
     "Evaluation",
+    "one_policy",
     "read_evaluations",
     "read_metrics",
     "read_seconds",
@@ -32,9 +32,6 @@ SIGNALS = (_SWITCH_RATE, "l1/u_a", "l1/saturation")
 
 _METRICS = ("iteration", "real_steps", "return_mean", "return_deterministic")
 _NUMBERS = ("bias", "gain", "return_mean", "episodes")
-
-TRAINING_PHASES = ("random", "fit", "trpo", "collect", "evaluate")
-"""Columns of a ``timing.csv``, in the order in which an outer iteration goes through them."""
 
 
 @dataclass(frozen=True)
@@ -96,13 +93,13 @@ def read_metrics(file: Path) -> dict[str, np.ndarray]:
     return columns
 
 
-def read_seconds(file: Path, iterations: int) -> dict[str, np.ndarray]:
-    """Seconds of each of the :data:`TRAINING_PHASES` in each iteration; NaN where not known."""
-    rows = _rows(file, ("iteration",), optional=TRAINING_PHASES) if file.exists() else []
+def read_seconds(file: Path, iterations: int, phases: Sequence[str]) -> dict[str, np.ndarray]:
+    """Seconds of each of the phases in each iteration; NaN where not known."""
+    rows = _rows(file, ("iteration",), optional=phases) if file.exists() else []
     found = {int(row["iteration"]): row for row in rows}
     return {
         phase: np.array([found.get(i, {}).get(phase, np.nan) for i in range(iterations)])
-        for phase in TRAINING_PHASES
+        for phase in phases
     }
 
 
@@ -118,6 +115,16 @@ def read_evaluations(file: Path) -> list[Evaluation]:
         )
         for row in _rows(file, _NUMBERS, ("l1", "noise", "policy"), optional)
     ]  # fmt: skip
+
+
+def one_policy(tests: Sequence[Evaluation]) -> list[Evaluation]:
+    """The tests of what acts in one way only: each once, as ``stochastic``, however named."""
+    first = sorted(tests, key=lambda test: test.policy != "stochastic")
+    found = [replace(test, policy="stochastic") for test in first]
+    chosen: dict[Any, Evaluation] = {}
+    for test in found:
+        chosen.setdefault((test.condition, test.own_l1), test)
+    return list(chosen.values())
 
 
 def _known(value: float) -> float | None:

@@ -9,7 +9,14 @@ from torchrl_l1.report.evaluation_tables import PHASES
 from torchrl_l1.report.settings import BASELINE
 from torchrl_l1.report.tables import Footnotes, interval_text, markdown, number
 
-__all__ = ["ablation_table", "evaluation_table", "paired_table", "training_table"]
+__all__ = [
+    "ablation_table",
+    "algorithm_pairs_table",
+    "algorithm_table",
+    "evaluation_table",
+    "paired_table",
+    "training_table",
+]
 
 Row = Mapping[str, Any]
 
@@ -49,7 +56,42 @@ def paired_table(rows: Sequence[Row]) -> str:
             "noise": row["noise"],
             "L1": row["l1"],
             "variant": row["variant"],
-            "policy": row["policy"],
+            "policy": row.get("policy", ""),
+            "pairs": str(row["pairs"]),
+            **_difference(row),
+            "seeds without a pair": row["without_pair"],
+        }
+        for row in rows
+    ]
+    return markdown(lines)
+
+
+def algorithm_table(rows: Sequence[Row]) -> str:
+    """The algorithms with each L1 setting, task by task."""
+    lines = [
+        {
+            "task": row["task"],
+            "noise": row["noise"],
+            "algorithm": row["algorithm"],
+            "L1": row["l1"],
+            "return ± spread": _spread(row.get("return_mean"), row.get("published_spread")),
+            "95 % interval": _interval(row, "return"),
+            "seeds": str(row["seeds"]),
+            "real steps": str(row.get("real_steps", "–")),
+            "unfinished": row["unfinished"],
+        }
+        for row in rows
+    ]
+    return markdown(lines)
+
+
+def algorithm_pairs_table(rows: Sequence[Row]) -> str:
+    """Differences between algorithms."""
+    lines = [
+        {
+            "task": row["task"],
+            "noise": row["noise"],
+            "difference": f"{row['of']} less {row['less']}",
             "pairs": str(row["pairs"]),
             **_difference(row),
             "seeds without a pair": row["without_pair"],

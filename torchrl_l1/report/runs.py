@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_l1.report.reading import TRAINING_PHASES, Evaluation
+from torchrl_l1.report.algorithms import MEASURING
+from torchrl_l1.report.reading import Evaluation
 from torchrl_l1.report.settings import Identity
 from torchrl_l1.report.statistics import final_return
 
@@ -25,9 +26,11 @@ class Run:
         identity: what the run is one sample of.
         real_steps: real environment steps ``(T,)`` after each outer iteration.
         returns: mean return ``(T,)`` of the stochastic policy.
-        deterministic: mean return ``(T,)`` with the policy's mean action.
+        deterministic: mean return ``(T,)`` with the policy's mean action; the same where there is
+            one way to act only.
         signals: ``(T,)`` each: what L1 did, see ``SIGNALS``; NaN without L1.
-        seconds: wall-clock time ``(T,)`` of each phase, see ``TRAINING_PHASES``; NaN if unknown.
+        seconds: wall-clock time ``(T,)`` of each phase, see ``AlgorithmFacts.phases``; NaN
+            if unknown.
         versions: what it ran with.
         evaluations: by name of the evaluation.
     """
@@ -68,9 +71,9 @@ class Run:
 
     @property
     def training_seconds(self) -> np.ndarray:
-        """Time ``(T,)`` of random data, fit, TRPO and collection; NaN if unknown."""
-        *phases, _ = TRAINING_PHASES
-        return np.sum([self.seconds[phase] for phase in phases], axis=0)
+        """Time ``(T,)`` of all phases but the measuring of returns; NaN if unknown."""
+        phases = [seconds for phase, seconds in self.seconds.items() if phase != MEASURING]
+        return np.sum(phases, axis=0)
 
     @property
     def milliseconds_per_step(self) -> float:

@@ -14,6 +14,7 @@ from torchrl_l1.experiment.l1_options import closest_option, departures, filter_
 from torchrl_l1.experiment.recipes import shared_dir
 from torchrl_l1.experiment.schema import schema_defaults
 from torchrl_l1.experiment.settings import VOLATILE_KEYS, L1Settings, flatten
+from torchrl_l1.report.algorithms import facts
 
 __all__ = ["BASELINE", "NOISES", "Identity", "identify"]
 
@@ -37,7 +38,8 @@ class Identity:
     Attributes:
         algorithm: ``metrpo``, ``pets``, or ``dets`` for PETS with members that predict points.
         task: such as ``half_cheetah``.
-        noise: option of the ``noise`` group that its noise is equal to, else the noise in words.
+        noise: option of the ``noise`` group that its noise is equal to, else what there is of it
+            with its half-width, such as ``action 0.3``.
         arm: ``off``, or the option of the ``l1`` group that its controller is closest to,
             whatever the gain of its filter.
         seed: its seed.
@@ -66,6 +68,12 @@ class Identity:
     def model_form(self) -> str:
         """``nonlinear`` or ``affine`` in the control."""
         return self.shared.get("model.form", "nonlinear")
+
+    @property
+    def as_published(self) -> bool:
+        """Whether the published tables are of such runs: algorithm, model and controller."""
+        affine = self.model_form == "affine"
+        return facts(self.algorithm).published and not affine and not self.departures
 
 
 def identify(config: Mapping[str, Any]) -> Identity:
@@ -126,8 +134,9 @@ def _noise(settings: Mapping[str, Any]) -> str:
     for name, values in _noises().items():
         if all(settings.get(f"perturbation.{key}") == value for key, value in values.items()):
             return name
-    action, observation = (settings.get(key) for key in _NOISE_KEYS)
-    return f"action {action:g}, observation {observation:g}"
+    # perturbation.action_noise is shown as "action".
+    levels = {key.split(".")[1].split("_")[0]: float(settings[key]) for key in _NOISE_KEYS}
+    return ", ".join(f"{kind} {level:g}" for kind, level in levels.items() if level)
 
 
 @cache

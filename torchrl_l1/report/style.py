@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -17,11 +19,15 @@ from matplotlib.figure import Figure
 from torchrl_l1.report.settings import BASELINE
 
 __all__ = [
+    "algorithm_color",
+    "algorithm_label",
     "arm_label",
+    "arm_style",
     "color",
     "fit_scale",
     "grid",
     "legend_below",
+    "named",
     "noise_words",
     "save",
     "title",
@@ -29,6 +35,8 @@ __all__ = [
 
 # Okabe and Ito: told apart with any colour vision. Grey is kept for the authors' curves.
 _ARMS = {"off": "#D55E00", "paper": "#0072B2", "reference": "#009E73", "slow": "#CC79A7"}
+# Not those of the arms, which vary within an algorithm.
+_ALGORITHMS = {"metrpo": "#000000", "pets": "#CC79A7", "dets": "#009E73"}
 _CYCLE = ("#D55E00", "#0072B2", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#000000")
 
 _NOISES = {
@@ -49,6 +57,45 @@ def arm_label(arm: str) -> str:
     return "L1 off" if arm == BASELINE else f"L1 {arm}"
 
 
+def arm_style(arm: str, arms: Sequence[str]) -> Any:
+    """Style of an arm's lines where the colour is that of the algorithm.
+
+    Args:
+        arm: the arm.
+        arms: all of them.
+    """
+    styles = ("-", "-.", (0, (6, 1, 1, 1, 1, 1)), (0, (1, 1)))
+    on = [other for other in arms if other != BASELINE]
+    return "--" if arm == BASELINE else styles[on.index(arm) % len(styles)]
+
+
+def algorithm_color(algorithm: str) -> str:
+    """Colour of an algorithm."""
+    return _ALGORITHMS.get(algorithm, "#E69F00")
+
+
+def algorithm_label(name: str, arm: str) -> str:
+    """An algorithm with an arm, as the paper names them.
+
+    Examples:
+        >>> [algorithm_label("PETS", arm) for arm in ("off", "paper", "reference")]
+        ['PETS', 'L1-PETS', 'L1-PETS (reference)']
+    """
+    if arm == BASELINE:
+        return name
+    return f"L1-{name}" if arm == "paper" else f"L1-{name} ({arm})"
+
+
+def named(name: str, text: str) -> str:
+    """A heading or caption under the name of an algorithm, if it has one.
+
+    Examples:
+        >>> named("PETS", "Training"), named("", "Training")
+        ('PETS: Training', 'Training')
+    """
+    return f"{name}: {text}" if name else text
+
+
 def title(task: str, noise: str | None = None) -> str:
     """A task's name in headings, with its noise.
 
@@ -61,8 +108,18 @@ def title(task: str, noise: str | None = None) -> str:
 
 
 def noise_words(noise: str) -> str:
-    """A noise setting in headings."""
-    return _NOISES.get(noise, f"noise {noise}")
+    """A noise setting in headings.
+
+    Examples:
+        >>> noise_words("none"), noise_words("action 0.3, observation 0.05")
+        ('no noise', 'action noise 0.3 and observation noise 0.05')
+    """
+    if noise in _NOISES:
+        return _NOISES[noise]
+    levels = [re.fullmatch(r"(\w+) (\S+)", part) for part in noise.split(", ")]
+    if not all(levels):
+        return f"noise {noise}"
+    return " and ".join(f"{level[1]} noise {level[2]}" for level in levels if level)
 
 
 def grid(panels: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:

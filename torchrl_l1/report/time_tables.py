@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_l1.report.reading import TRAINING_PHASES
 from torchrl_l1.report.tables import markdown, number
 from torchrl_l1.report.variants import Study
 
@@ -18,23 +17,24 @@ _WORDS = {"fit": "fit", "trpo": "TRPO", "collect": "collection", "evaluate": "me
 def time_rows(study: Study) -> list[dict[str, Any]]:
     """Seconds per outer iteration in each phase, for each main cell whose times are known.
 
-    ``fit``, ``trpo``, ``collect`` and ``evaluate`` are medians over all outer iterations of all
-    finished runs, and ``ms_per_step`` is the training time per real step of whole runs, random
-    data included and ``evaluate`` left out.
+    ``fit``, ``trpo`` (if the algorithm has it), ``collect`` and ``evaluate`` are medians over all
+    outer iterations of all finished runs, and ``ms_per_step`` is the training time per real step of
+    whole runs, random data included and ``evaluate`` left out.
     """
     rows = []
+    phases = [phase for phase in study.facts.phases if phase in _WORDS]
     for cell, runs in study.cells.items():
         timed = [run for run in runs if run.finished and np.isfinite(run.milliseconds_per_step)]
         if cell.variant or not timed:
             continue
-        seconds = {k: np.concatenate([run.seconds[k] for run in timed]) for k in TRAINING_PHASES}
+        seconds = {k: np.concatenate([run.seconds[k] for run in timed]) for k in phases}
         rows.append(
             {
                 "task": cell.task,
                 "noise": cell.noise,
                 "l1": cell.arm,
                 "runs": len(timed),
-                **{phase: float(np.median(seconds[phase])) for phase in _WORDS},
+                **{phase: float(np.median(seconds[phase])) for phase in phases},
                 "ms_per_step": float(np.mean([run.milliseconds_per_step for run in timed])),
             }
         )
@@ -50,7 +50,7 @@ def time_table(rows: list[dict[str, Any]]) -> str:
                 "noise": row["noise"],
                 "L1": row["l1"],
                 "runs": str(row["runs"]),
-                **{f"{words}, s": number(row[phase]) for phase, words in _WORDS.items()},
+                **{f"{w}, s": number(row[phase]) for phase, w in _WORDS.items() if phase in row},
                 "training, ms per real step": number(row["ms_per_step"]),
             }
             for row in rows

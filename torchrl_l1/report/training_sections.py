@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from torchrl_l1.report.learning_curves import plot_comparison, plot_task
-from torchrl_l1.report.page import Page, slug
+from torchrl_l1.report.page import Page
 from torchrl_l1.report.reference_curves import ReferenceCurves
 from torchrl_l1.report.rendering import paired_table, training_table
 from torchrl_l1.report.style import title
@@ -15,7 +15,15 @@ __all__ = ["training_sections"]
 
 
 def training_sections(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
-    """Everything that is known from the runs' own returns."""
+    """Everything that is known from the runs' own returns.
+
+    Args:
+        page: where to.
+        study: the runs.
+        reference: published curves; left out where they are of another algorithm.
+    """
+    if not study.facts.published:
+        reference = None
     _training(page, study, reference)
     _pairs(page, study)
     _curves(page, study, reference)
@@ -27,8 +35,9 @@ def _training(page: Page, study: Study, reference: ReferenceCurves | None) -> No
     rows = {cell: training_row(cell, runs, reference) for cell, runs in study.cells.items()}
     page.heading(
         "Training",
-        "Return is the mean over seeds of the mean over the last three outer iterations, of "
-        "sampled actions as in the paper; the spread is the paper's ± (standard deviation over "
+        "Return is the mean over seeds of the mean over the last three outer iterations"
+        + ", of sampled actions as in the paper" * study.facts.samples
+        + "; the spread is the paper's ± (standard deviation over "
         "seeds in each of these iterations, averaged), the interval that of the mean over seeds. "
         "What L1 did (switches, mean norm of its input, share of actions that a bound cut) are "
         "means over the same iterations.",
@@ -75,12 +84,16 @@ def _pairs(page: Page, study: Study) -> None:
 def _curves(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
     page.heading(
         "Learning curves",
-        "Thin: single seeds; bold: their mean; dashed: mean of the return with the mean action; "
-        "grey: mean of the authors' logs, where they were given, cut where ours end.",
+        "Thin: single seeds; bold: their mean"
+        + "; dashed: mean of the return with the mean action" * study.facts.samples
+        + "; grey: mean of the authors' logs, where they were given, cut where ours end"
+        * study.facts.published
+        + ".",
     )
     for task in study.tasks():
-        file = plot_task(study, task, page.folder / f"learning_curves_{task}.png", reference)
-        page.figure(file, f"Learning curves, {title(task)}")
+        file = page.file("learning_curves", task)
+        figure = plot_task(study, task, file, reference, page.name)
+        page.figure(figure, f"Learning curves, {title(task)}")
 
 
 def _comparisons(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
@@ -91,7 +104,7 @@ def _comparisons(page: Page, study: Study, reference: ReferenceCurves | None) ->
             "The same table for runs that depart from the main ones in these settings, and the "
             "main ones of the same task and noise."
             + " It is the comparison of the paper's Figure 2."
-            * ("model.form" in keys),
+            * ("model.form" in keys and study.facts.published),
         )
         rows = [
             training_row(cell, study.cells[cell], reference)
@@ -100,8 +113,8 @@ def _comparisons(page: Page, study: Study, reference: ReferenceCurves | None) ->
         ]
         page.text(training_table(rows))
         for task in dict.fromkeys(cell.task for cell in cells):
-            name = page.folder / f"by_{slug(keys)}_{task}.png"
-            figure = plot_comparison(study, task, keys, name, reference)
+            file = page.file("by", *keys, task)
+            figure = plot_comparison(study, task, keys, file, reference, page.name)
             page.figure(figure, f"Learning curves by {', '.join(keys)}, {title(task)}")
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_l1.report.algorithms import facts
 from torchrl_l1.report.published import published_cell
 from torchrl_l1.report.reference_curves import ReferenceCurves
 from torchrl_l1.report.runs import Run
@@ -33,7 +34,7 @@ def run_rows(study: Study) -> list[dict[str, Any]]:
             "of": run.identity.outer_iterations,
             "real_steps": int(run.real_steps[-1]) if len(run.real_steps) else 0,
             "return": run.final if run.finished else None,
-            "return_deterministic": run.final_deterministic if run.finished else None,
+            **_deterministic(run, study),
             **(_signals([run]) if run.finished else {}),
             "path": str(run.path),
         }
@@ -56,7 +57,8 @@ def training_row(
         row |= _summary("return", [run.final for run in done])
         if len(done) > 1:
             row["published_spread"] = published_spread(np.array([run.returns for run in done]))
-        row |= _summary("deterministic", [run.final_deterministic for run in done])
+        if facts(runs[0].identity.algorithm).samples:
+            row |= _summary("deterministic", [run.final_deterministic for run in done])
         row["real_steps"] = round(float(np.mean([run.real_steps[-1] for run in done])))
         row |= _signals(done)
     row["unfinished"] = "; ".join(
@@ -65,7 +67,7 @@ def training_row(
     what = runs[0].identity
     affine = what.model_form == "affine"
     # The paper prints no returns with control-affine models; their curves are in its Figure 2.
-    published = None if affine or what.departures else published_cell(*place, *place[1:])
+    published = published_cell(*place, *place[1:]) if what.as_published else None
     if published is not None:
         row |= published.columns()
     curves = None
@@ -83,7 +85,10 @@ def training_row(
 
 
 def paired_rows(study: Study) -> list[dict[str, Any]]:
-    """L1 less the baseline over the seeds that both have, by stochastic and mean actions."""
+    """L1 less the baseline over the seeds that both have, by stochastic and mean actions.
+
+    Where there is one way to act only, a row has no ``policy``.
+    """
     rows = []
     for cell, runs in study.cells.items():
         if cell.arm == BASELINE:
@@ -95,7 +100,7 @@ def paired_rows(study: Study) -> list[dict[str, Any]]:
                 pairs.append((run, baseline))
             else:
                 single.append(str(run.identity.seed))
-        for policy in ("stochastic", "deterministic"):
+        for policy in study.facts.policies:
             finals = [
                 (l1.final, off.final)
                 if policy == "stochastic"
@@ -106,7 +111,7 @@ def paired_rows(study: Study) -> list[dict[str, Any]]:
             rows.append(
                 {
                     **_place(cell),
-                    "policy": policy,
+                    **({"policy": policy} if study.facts.samples else {}),
                     "pairs": len(pairs),
                     "seeds": " ".join(str(run.identity.seed) for run, _ in pairs),
                     **difference_summary(differences),
@@ -147,6 +152,13 @@ def _signals(runs: Sequence[Run]) -> dict[str, float]:
     }
     means = {name: float(np.mean(numbers)) for name, numbers in values.items()}
     return {name: mean for name, mean in means.items() if np.isfinite(mean)}
+
+
+def _deterministic(run: Run, study: Study) -> dict[str, float | None]:
+    """The return with mean actions, if it is another one."""
+    if not study.facts.samples:
+        return {}
+    return {"return_deterministic": run.final_deterministic if run.finished else None}
 
 
 def _place(cell: Cell) -> dict[str, Any]:

@@ -38,7 +38,7 @@ def tuning_rows(rows: Sequence[Row]) -> tuple[str, list[Row]]:
         rows: of one cell of the training.
     """
     tuned = {row["policy"] for row in rows if "option" in row}
-    policy = "stochastic" if "stochastic" in tuned else "deterministic"
+    policy = "deterministic" if tuned == {"deterministic"} else "stochastic"
     return policy, [row for row in rows if row["policy"] == policy]
 
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from torchrl_l1.envs import TASKS
+from torchrl_l1.report.algorithms import ALGORITHMS, AlgorithmFacts, facts
 from torchrl_l1.report.duplicates import distinct
 from torchrl_l1.report.runs import Run
 from torchrl_l1.report.settings import BASELINE, NOISES, default_text
 
-__all__ = ["Cell", "Study", "variant_text"]
+__all__ = ["Cell", "Study", "noise_order", "studies", "variant_text"]
 
 Deviations = tuple[tuple[str, str], ...]
 
@@ -39,7 +41,7 @@ def variant_text(variant: Deviations) -> str:
 
 
 class Study:
-    """Runs by cell.
+    """The runs of an algorithm by cell.
 
     The settings of a task that most of its combinations of noise and arm were run with are its
     main ones; what departs from them is a variant and is never pooled with them. Settings of
@@ -49,9 +51,18 @@ class Study:
         runs: the runs, in any order. Of those with equal settings and seed the one that is
             furthest stays, with the evaluations of all that are as far, and the others go to
             :attr:`duplicates`.
+
+    Raises:
+        ValueError: if there are no runs, or several algorithms; :func:`studies` takes these.
     """
 
     def __init__(self, runs: Sequence[Run]) -> None:
+        algorithms = {run.identity.algorithm for run in runs}
+        if len(algorithms) != 1:
+            raise ValueError(
+                f"a study is of one algorithm, got {', '.join(sorted(algorithms)) or 'no runs'}"
+            )
+        (self.algorithm,) = algorithms
         self.runs, self.duplicates = distinct(
             runs, lambda run: (*_pairing_key(run), run.identity.arm, _frozen(run.identity.l1))
         )
@@ -68,6 +79,11 @@ class Study:
         for run in sorted(self.runs, key=lambda run: run.identity.seed):
             self.cells.setdefault(self.cell(run), []).append(run)
         self.cells = dict(sorted(self.cells.items(), key=lambda item: _order(item[0])))
+
+    @property
+    def facts(self) -> AlgorithmFacts:
+        """What there is to know of the algorithm."""
+        return facts(self.algorithm)
 
     def cell(self, run: Run) -> Cell:
         """The cell of a run."""
@@ -115,6 +131,18 @@ class Study:
             if other.identity.arm == BASELINE and _pairing_key(other) == _pairing_key(run):
                 return other
         return None
+
+
+def studies(runs: Sequence[Run]) -> list[Study]:
+    """A study for each algorithm, in the order of :data:`ALGORITHMS`.
+
+    Runs of different algorithms are samples of different things, and what sets them apart is more
+    than some settings: they are not pooled, and are no variants of each other.
+    """
+    groups: dict[str, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(run.identity.algorithm, []).append(run)
+    return [Study(groups[name]) for name in ALGORITHMS if name in groups]
 
 
 def _pairing_key(run: Run) -> tuple[object, ...]:
@@ -167,9 +195,19 @@ def _main_settings(
     return dict(zip(keys, best, strict=True))
 
 
-def noise_order(noise: str) -> tuple[int, str]:
-    """Sort key: the paper's order, then the alphabet."""
-    return _place(NOISES, noise)
+def noise_order(noise: str) -> tuple[object, ...]:
+    """Sort key: the paper's order, then noise of other strengths, by its kind and its strength.
+
+    Examples:
+        >>> sorted(["action 0.3, observation 1", "action 1e-05", "action 0.3", "both"],
+        ...        key=noise_order)
+        ['both', 'action 1e-05', 'action 0.3', 'action 0.3, observation 1']
+    """
+    index, name = _place(NOISES, noise)
+    parts = [re.fullmatch(r"(\w+) (\S+)", part) for part in noise.split(", ")]
+    kinds = tuple(part[1] for part in parts if part)
+    levels = tuple(_number_first(part[2]) for part in parts if part)
+    return index, len(kinds), kinds, levels, name
 
 
 def _order(cell: Cell) -> tuple[object, ...]:

@@ -1,0 +1,132 @@
+"""The algorithms side by side, as rows of values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from torchrl_l1.report.runs import Run
+from torchrl_l1.report.settings import BASELINE
+from torchrl_l1.report.style import algorithm_label
+from torchrl_l1.report.training_tables import difference_summary, training_row
+from torchrl_l1.report.variants import Cell, Study, noise_order
+
+__all__ = ["algorithm_pairs", "algorithm_rows", "compared_places", "differing_settings"]
+
+# Of a row of the training, what can be compared.
+_KEYS = (
+    "seeds",
+    "return_mean",
+    "return_low",
+    "return_high",
+    "published_spread",
+    "real_steps",
+    "unfinished",
+)
+
+
+def compared_places(studies: Sequence[Study]) -> dict[str, list[str]]:
+    """Noises by task in which several algorithms have main cells."""
+    found: dict[tuple[str, str], set[str]] = {}
+    for study in studies:
+        for cell in study.cells:
+            if not cell.variant:
+                found.setdefault((cell.task, cell.noise), set()).add(study.algorithm)
+    places: dict[str, list[str]] = {}
+    for (task, noise), algorithms in found.items():
+        if len(algorithms) > 1:
+            places.setdefault(task, []).append(noise)
+    return {task: sorted(noises, key=noise_order) for task, noises in places.items()}
+
+
+def algorithm_rows(studies: Sequence[Study]) -> list[dict[str, Any]]:
+    """The return of each algorithm with each L1 setting, as in the tables of the training."""
+    rows = []
+    for task, noise in _places(studies):
+        for study, cell, runs in _cells(studies, task, noise):
+            whole = training_row(cell, runs)
+            rows.append(
+                {
+                    "task": task,
+                    "noise": noise,
+                    "algorithm": study.facts.name,
+                    "l1": cell.arm,
+                    **{key: whole[key] for key in _KEYS if key in whole},
+                }
+            )
+    return rows
+
+
+def algorithm_pairs(studies: Sequence[Study]) -> list[dict[str, Any]]:
+    """What an algorithm reaches, less what one before it does, over the seeds that both have.
+
+    Each L1 setting is compared with the other algorithm without L1 and with the same setting.
+    """
+    rows = []
+    for task, noise in _places(studies):
+        cells = list(_cells(studies, task, noise))
+        for study, cell, runs in cells:
+            for other, base, against in cells:
+                if studies.index(other) < studies.index(study) and base.arm in (BASELINE, cell.arm):
+                    rows.append(
+                        {
+                            "task": task,
+                            "noise": noise,
+                            "of": algorithm_label(study.facts.name, cell.arm),
+                            "less": algorithm_label(other.facts.name, base.arm),
+                            **_differences(runs, against),
+                        }
+                    )
+    return rows
+
+
+def differing_settings(studies: Sequence[Study], task: str) -> dict[str, dict[str, str]]:
+    """Settings that several algorithms have and that differ: their values by algorithm.
+
+    Settings of the controller are compared between cells of the same L1 setting.
+    """
+    found: dict[tuple[str, str], dict[str, str]] = {}
+    for study in studies:
+        for cell, runs in study.cells.items():
+            if cell.task != task or cell.variant:
+                continue
+            what = runs[0].identity
+            label = algorithm_label(study.facts.name, cell.arm)
+            for key, value in what.shared.items():
+                found.setdefault(("", key), {})[study.facts.name] = value
+            for key, value in what.l1.items():
+                found.setdefault((cell.arm, key), {})[label] = value
+    # What the algorithm is called is no setting.
+    return {
+        key: values
+        for (_, key), values in found.items()
+        if key not in ("algorithm", "recipe") and len(set(values.values())) > 1
+    }
+
+
+def _places(studies: Sequence[Study]) -> list[tuple[str, str]]:
+    return [(task, noise) for task, noises in compared_places(studies).items() for noise in noises]
+
+
+def _cells(
+    studies: Sequence[Study], task: str, noise: str
+) -> Iterator[tuple[Study, Cell, Sequence[Run]]]:
+    for study in studies:
+        for cell, runs in study.cells.items():
+            if (cell.task, cell.noise, cell.variant) == (task, noise, ()):
+                yield study, cell, runs
+
+
+def _differences(runs: Sequence[Run], against: Sequence[Run]) -> Mapping[str, Any]:
+    ours, theirs = (
+        {run.identity.seed: run.final for run in cell if run.finished} for cell in (runs, against)
+    )
+    seeds = [seed for seed in ours if seed in theirs]
+    return {
+        "pairs": len(seeds),
+        "seeds": " ".join(map(str, seeds)),
+        **difference_summary([ours[seed] - theirs[seed] for seed in seeds]),
+        "without_pair": " ".join(
+            str(run.identity.seed) for run in runs if run.identity.seed not in seeds
+        ),
+    }
