@@ -80,6 +80,8 @@ def test_precision_is_chosen_by_what_the_processor_can(monkeypatch):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_bf16": True})
     assert resolve_precision("auto") == "bfloat16"
     assert resolve_precision("auto", "meta") == "float32"
+    assert resolve_precision("auto", "cpu", 64) == "float32"
+    assert resolve_precision("bfloat16", "cpu", 64) == "bfloat16"
     assert resolve_precision("float32") == "float32"
     with pytest.raises(ValueError, match=r"precision must be .* got 'float16'"):
         resolve_precision("float16")

@@ -178,7 +178,9 @@ class PETS:
 
     def choices(self) -> dict[str, str]:
         """Where plans are made, and in which precision."""
-        precision = resolve_precision(self.config.precision, self.device)
+        hidden = self.dynamics.network.weights[:-1]
+        width = min((weight.shape[2] for weight in hidden), default=0)
+        precision = resolve_precision(self.config.precision, self.device, width)
         return {"device": str(self.device), "precision": precision}
 
     def weights(self) -> dict[str, dict[str, Any]]:

@@ -28,10 +28,19 @@ _ACTIVATIONS: dict[str, tuple[Callable[[Tensor], Tensor], float]] = {
 _ALIGNMENT = 16
 
 
+# Narrower products cost more to convert and to call than they save.
+_LEAST_WIDTH = 192
+
+
 def resolve_precision(
-    precision: str, device: torch.device | str = "cpu"
+    precision: str, device: torch.device | str = "cpu", width: int = _LEAST_WIDTH
 ) -> Literal["float32", "bfloat16"]:
-    """``"auto"`` becomes ``"bfloat16"`` on processors that multiply it natively.
+    """``"auto"`` becomes ``"bfloat16"`` for wide layers on processors that multiply it natively.
+
+    Args:
+        precision: ``"auto"``, or what is to be returned.
+        device: where the products are computed.
+        width: of the narrowest hidden layer.
 
     Raises:
         ValueError: for an unknown precision.
@@ -42,7 +51,7 @@ def resolve_precision(
         return "bfloat16"
     if precision != "auto":
         raise ValueError(f"precision must be 'auto', 'float32' or 'bfloat16', got {precision!r}")
-    if torch.device(device).type != "cpu":
+    if torch.device(device).type != "cpu" or width < _LEAST_WIDTH:
         return "float32"
     # Only recent versions of torch tell.
     tell: Callable[[], dict[str, Any]] = getattr(torch.cpu, "get_capabilities", dict)
@@ -101,7 +110,8 @@ class PlanningNetwork:
             ValueError: for an unknown precision.
         """
         device = dynamics.change_normalizer.mean.device
-        hidden = getattr(torch, resolve_precision(precision, device))
+        widths = [weight.shape[2] for weight in dynamics.network.weights[:-1]]
+        hidden = getattr(torch, resolve_precision(precision, device, min(widths, default=0)))
         elites = dynamics.elites.to(device)
         weights = [weight[elites].double() for weight in dynamics.network.weights]
         biases = [bias[elites, 0].double() for bias in dynamics.network.biases]
