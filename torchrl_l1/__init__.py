@@ -6,7 +6,7 @@ and ``report``.
 """
 
 from torchrl_l1._version import __version__
-from torchrl_l1.algorithms import METRPO, METRPOConfig
+from torchrl_l1.algorithms import METRPO, PETS, METRPOConfig, PETSConfig
 from torchrl_l1.control import (
     ActionJacobian,
     Affinizer,
@@ -21,6 +21,7 @@ from torchrl_l1.planning import CEMConfig, ModelPredictiveController, Trajectory
 
 __all__ = [
     "METRPO",
+    "PETS",
     "ActionJacobian",
     "Affinizer",
     "BatchedMujocoEnv",
@@ -34,6 +35,7 @@ __all__ = [
     "L1Transform",
     "METRPOConfig",
     "ModelPredictiveController",
+    "PETSConfig",
     "TrajectorySampler",
     "__version__",
     "make_env",
