@@ -99,6 +99,28 @@ def test_no_table_of_differences_without_pairs(write_run: WriteRun, tmp_path: Pa
     assert not (page.parent / "pairs.csv").exists()
 
 
+def test_swept_controllers_have_a_line_each(write_run: WriteRun, tmp_path: Path) -> None:
+    base = {"bias": 0.0, "gain": 1.0, "episodes": 5, "policy": "stochastic", "noise": "none"}
+    for seed in range(2):
+        swept = [
+            base | {"l1": "paper", "epsilon": e, "alpha": a, "return_mean": e - seed}
+            for e in (0.5, 2.0)
+            for a in (0.1, 0.35)
+        ]
+        off = base | {"l1": "off", "epsilon": "", "alpha": "", "return_mean": -seed}
+        write_run([1], "l1=off", seed=seed, evaluations={"sweep": [off, *swept]})
+    text = report([tmp_path / "runs"]).read_text()
+    section = text.split("\n## Evaluation `sweep`\n")[1].split("\n## ")[0]
+    lines = [line for line in section.splitlines() if line.startswith("| inverted_pendulum")]
+    assert lines == [
+        "| inverted_pendulum | none | off | – | – | 2 | -0.5 ± 0.5 | – |",
+        "| inverted_pendulum | none | paper | 0.5 | 0.1 | 2 | 0 ± 0.5 | 0.5, 0.5 |",
+        "| inverted_pendulum | none | paper | 0.5 | 0.35 | 2 | 0 ± 0.5 | 0.5, 0.5 |",
+        "| inverted_pendulum | none | paper | 2 | 0.1 | 2 | 1.5 ± 0.5 | 2, 2 |",
+        "| inverted_pendulum | none | paper | 2 | 0.35 | 2 | 1.5 ± 0.5 | 2, 2 |",
+    ]
+
+
 def test_tables_have_as_many_cells_as_columns(campaign: Path) -> None:
     text = report([campaign]).read_text()
     tables = re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)

@@ -9,7 +9,7 @@ from torchrl_l1.report.algorithms import AlgorithmFacts
 from torchrl_l1.report.evaluation_figures import plot_ablation, plot_disturbances
 from torchrl_l1.report.evaluation_tables import ablation_rows, evaluation_names, evaluation_rows
 from torchrl_l1.report.page import Page
-from torchrl_l1.report.rendering import ablation_table, evaluation_table
+from torchrl_l1.report.rendering import ablation_table, evaluation_table, tuning_table
 from torchrl_l1.report.settings import BASELINE
 from torchrl_l1.report.style import arm_label, named, noise_words, title
 from torchrl_l1.report.tuning_figures import plot_tuning, tuning_rows
@@ -134,7 +134,9 @@ def _evaluation_tables(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row
             chosen = [r for r in rows if (r["training_l1"], r["policy"]) == (l1, policy)]
             if chosen and len(chosen) <= _MOST_ROWS:
                 words = _listed(f"Trained with {arm_label(l1)}", actions)
-                page.text(f"{words}:", evaluation_table(chosen))
+                swept = any("option" in row for row in chosen)
+                table = tuning_table if swept else evaluation_table
+                page.text(f"{words}:", table(chosen))
 
 
 def _listed(*words: str) -> str:

@@ -16,6 +16,7 @@ __all__ = [
     "evaluation_table",
     "paired_table",
     "training_table",
+    "tuning_table",
 ]
 
 Row = Mapping[str, Any]
@@ -130,6 +131,33 @@ def evaluation_table(rows: Sequence[Row]) -> str:
         line |= {f"paper, L1 {l1}": _paper(found.get(l1, {}), notes) for l1 in tested}
         lines.append(line)
     return _with_notes(markdown(lines), notes)
+
+
+def tuning_table(rows: Sequence[Row]) -> str:
+    """The same where tests set values of the controller: a line per controller.
+
+    Args:
+        rows: of one kind of policy and one L1 setting of the training.
+    """
+    lines = [
+        {
+            "task": row["task"],
+            "training noise": "" if row["training_noise"] == "none" else row["training_noise"],
+            "variant": row["variant"],
+            "noise": row["noise"],
+            "bias": "" if row["bias"] == 0 else f"{row['bias']:g}",
+            "gain": "" if row["gain"] == 1 else f"{row['gain']:g}",
+            "L1": row.get("option", row["l1"]),
+            "epsilon": number(row.get("epsilon")),
+            "alpha": number(row.get("alpha")),
+            "training seeds": str(row["training_seeds"]),
+            "return": _with_interval(row),
+            "less off": _less_off(row),
+            "switches per 1000 steps": number(row.get("switches_per_1000_steps")),
+        }
+        for row in rows
+    ]
+    return markdown(lines)
 
 
 def ablation_table(rows: Sequence[Row]) -> str:
