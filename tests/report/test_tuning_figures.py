@@ -126,5 +126,5 @@ def test_report_shows_the_sweep_in_its_section(
     actions = {"stochastic": "sampled actions", "deterministic": "the mean action"}[policy]
     assert f"L1 off; tested with {actions}]({picture})" in section
     assert "dashed, the same policies without L1" in section
-    assert "| L1 paper epsilon=0.1 |" in section
+    assert "| paper | 0.1 |" in section
     assert [file.name for file in page.parent.glob("sweep_*")] == [picture]
