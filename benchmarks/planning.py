@@ -111,7 +111,9 @@ def check(worker: Peer, model: EnsembleDynamics, observation: Tensor, candidates
     generator = torch.Generator().manual_seed(0)
     shape = (1, candidates, CONFIG.horizon, model.action_dim)
     actions = 2 * torch.rand(shape, generator=generator) - 1
-    sampler = TrajectorySampler(model, cheetah.reward, particles=PARTICLES, precision="float32")
+    sampler = TrajectorySampler(
+        model, cheetah.reward, particles=PARTICLES, precision="float32", common_noise=False
+    )
     ours = sampler.evaluator(observation, generator)(actions)[0]
     found = worker.call("returns", observation=observation[0].tolist(), actions=actions[0].tolist())
     difference = torch.as_tensor(found) - ours

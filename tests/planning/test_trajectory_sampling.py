@@ -81,6 +81,37 @@ def test_ts1_has_the_moments_of_the_linear_gaussian_model(linear, particles):
 
 
 @pytest.mark.parametrize("propagation", ["ts1", "tsinf"])
+@pytest.mark.parametrize("block", [None, 7])
+def test_common_noise_is_the_same_for_every_candidate(linear, propagation, block):
+    members = [A[0]] * 3, [B[0]] * 3, C, STD
+    model, particles = linear(*members), 20_000
+    actions = torch.randn(1, 5, 4, 1, generator=torch.Generator().manual_seed(1))
+    actions = torch.cat([actions, actions[:, :1]], 1)
+
+    def returns(common: bool, particles: int) -> torch.Tensor:
+        return evaluate(
+            model,
+            torch.tensor([START]),
+            actions,
+            linear_reward,
+            particles=particles,
+            propagation=propagation,
+            common_noise=common,
+            block=block and block * particles,
+            generator=torch.Generator().manual_seed(3),
+        )[0].double()
+
+    common, own = returns(True, particles), returns(False, particles)
+    assert common[0] == pytest.approx(common[-1].item(), abs=1e-6)
+    assert own[0] != own[-1]
+    # Expectations are the same; where members differ in an offset alone, differences between
+    # candidates are free of noise, however few the particles.
+    torch.testing.assert_close(common, own, rtol=0, atol=0.05)
+    few = returns(True, 3)
+    torch.testing.assert_close(few - few[0], common - common[0], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("propagation", ["ts1", "tsinf"])
 def test_agrees_with_a_monte_carlo_simulation_of_the_model(linear, propagation):
     model, runs = linear(A, B, C, STD), 20_000
     model.set_elites([0, 2])
@@ -260,7 +291,13 @@ def test_sampler_copies_the_model_at_each_plan():
     x, actions = torch.randn(1, 3), torch.randn(1, 4, 5, 2)
     frozen = sampler.evaluator(x, torch.Generator().manual_seed(0))
     before = evaluate(
-        model, x, actions, curved_reward, particles=7, generator=torch.Generator().manual_seed(0)
+        model,
+        x,
+        actions,
+        curved_reward,
+        particles=7,
+        common_noise=True,
+        generator=torch.Generator().manual_seed(0),
     )
     with torch.no_grad():
         model.network.weights[0].mul_(1.5)

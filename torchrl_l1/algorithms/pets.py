@@ -98,6 +98,7 @@ class PETS:
             config.particles,
             config.propagation,  # type: ignore[arg-type]
             config.precision,  # type: ignore[arg-type]
+            config.common_noise,
         )
         self.policy = ModelPredictiveController(
             sampler,

@@ -31,6 +31,8 @@ class PETSConfig:
         particles: imagined trajectories per candidate sequence.
         propagation: how they travel through the ensemble: ``tsinf``, ``ts1`` or ``mean``, see
             :func:`~torchrl_l1.planning.evaluate`.
+        common_noise: whether the particles of all candidates meet the same draws of members and
+            noise in an iteration of the planner.
         precision: of the hidden layers in planning: ``float32``, ``bfloat16``, or ``auto`` for
             what the processor multiplies fastest.
         label: action that the model is fitted to: ``nominal`` is the planner's, ``executed`` what
@@ -50,6 +52,7 @@ class PETSConfig:
     replan_every: int = 1
     particles: int = 20
     propagation: str = "tsinf"
+    common_noise: bool = True
     precision: str = "auto"
     label: str = "executed"
     cem: CEMConfig = field(default_factory=CEMConfig)

@@ -153,12 +153,16 @@ class PlanningNetwork:
         """A member's mean prediction, normalised: ``(B, n + m)`` to ``(B, n)``."""
         return self.raw(inputs, member)[:, : self.observation_dim]
 
-    def sample(self, raw: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """A draw from the predictions that raw outputs stand for: ``(B, out)`` to ``(B, n)``."""
+    def sample(self, raw: Tensor, noise: Tensor | None) -> Tensor:
+        """A draw from the predictions that raw outputs stand for: ``(B, out)`` to ``(B, n)``.
+
+        Args:
+            raw: raw outputs.
+            noise: standard normal numbers ``(B, n)``; not needed by members that predict points.
+        """
         mean = raw[:, : self.observation_dim]
-        if self.standard_deviation is None:
+        if self.standard_deviation is None or noise is None:
             return mean
-        noise = torch.randn(mean.shape[::-1], generator=generator, device=mean.device).t()
         return torch.addcmul(mean, noise, self.standard_deviation(raw))
 
 

@@ -41,6 +41,7 @@ def evaluate(
     particles: int = 20,
     propagation: Propagation = "tsinf",
     terminated: Termination | None = None,
+    common_noise: bool = False,
     precision: Precision = "float32",
     block: int | None = None,
     generator: torch.Generator | None = None,
@@ -70,6 +71,10 @@ def evaluate(
         particles: trajectories per candidate, P.
         propagation: see above.
         terminated: maps next observations ``(..., n)`` to booleans ``(...)``; never if ``None``.
+        common_noise: let particle p of every candidate meet the same draws of members and of noise
+            (common random numbers, arXiv 1301.3878), instead of its own. Each return has the same
+            distribution, comparisons between candidates less variance, and most of the random
+            numbers need not be drawn.
         precision: of the hidden layers, see :class:`PlanningNetwork`.
         block: trajectories that go through the horizon together; ``None`` fits a processor's
             cache, or takes them all on other devices.
@@ -106,6 +111,9 @@ def evaluate(
         block = _CPU_BLOCK if sequences.device.type == "cpu" else _OTHER_BLOCK
     shares = _shares(network, particles, propagation)
     rows = network.members if propagation == "mean" else sum(shares)
+    common = None
+    if common_noise and propagation != "mean":
+        common = _scenarios(network, particles, horizon, generator, start)
     blocks = ceil(count * rows / block)
     size = max(1, ceil(count / blocks))
     for first in range(0, count, size):
@@ -115,7 +123,8 @@ def evaluate(
         plan = torch.cat([own.repeat_interleave(share) for share in shares])
         x = start[(first + plan) // actions.shape[1]]
         u = plans.permute(1, 2, 0)[..., plan].transpose(1, 2)
-        predict = _predictor(network, propagation, shares, plan, horizon, generator)
+        draws = _Draws(network, shares, plan.shape[0], horizon, common, generator)
+        predict = _predictor(network, propagation, shares, plan, draws)
         returns = _rollout(network, predict, x, u, reward, terminated)
         total[first : first + size].index_add_(0, plan, returns)
     mean = total / sum(shares)
@@ -134,6 +143,7 @@ class TrajectorySampler:
         terminated: the task's termination.
         particles: trajectories per candidate.
         propagation: ``"ts1"``, ``"tsinf"`` or ``"mean"``.
+        common_noise: here on by default.
         precision: ``"auto"``, ``"float32"`` or ``"bfloat16"``.
         block: trajectories that go through the horizon together.
 
@@ -147,6 +157,7 @@ class TrajectorySampler:
     particles: int = 20
     propagation: Propagation = "tsinf"
     precision: Precision = "auto"
+    common_noise: bool = True
     block: int | None = None
 
     def __post_init__(self) -> None:
@@ -166,6 +177,7 @@ class TrajectorySampler:
                 particles=self.particles,
                 propagation=self.propagation,
                 terminated=self.terminated,
+                common_noise=self.common_noise,
                 block=self.block,
                 generator=generator,
             )
@@ -212,13 +224,75 @@ def _shares(network: PlanningNetwork, particles: int, propagation: Propagation) 
     return [1 if propagation == "mean" else particles]
 
 
+_Scenarios = tuple[Tensor, Tensor]
+
+
+def _scenarios(
+    network: PlanningNetwork,
+    particles: int,
+    horizon: int,
+    generator: torch.Generator | None,
+    like: Tensor,
+) -> _Scenarios:
+    """What the particles of all candidates draw: members ``(H, P)`` and noise ``(H, n, P)``."""
+    size, device = (horizon, network.observation_dim, particles), like.device
+    members = torch.randint(
+        network.members, (horizon, particles), generator=generator, device=device
+    )
+    return members, torch.randn(size, generator=generator, device=device)
+
+
+class _Draws:
+    """Random numbers of B trajectories, sorted by member, candidate and particle."""
+
+    def __init__(
+        self,
+        network: PlanningNetwork,
+        shares: list[int],
+        count: int,
+        horizon: int,
+        common: _Scenarios | None,
+        generator: torch.Generator | None,
+    ) -> None:
+        self._network, self._count, self._horizon = network, count, horizon
+        self._common, self._generator = common, generator
+        self.device = network.bias.device
+        if common is not None:
+            every = torch.arange(sum(shares), device=self.device).split(shares)
+            candidates = count // sum(shares)
+            self._particle = torch.cat([own.repeat(candidates) for own in every])
+
+    def members(self) -> Tensor:
+        """A member for every step and trajectory ``(H, B)``."""
+        if self._common is not None:
+            return self._common[0][:, self._particle]
+        return torch.randint(
+            self._network.members,
+            (self._horizon, self._count),
+            generator=self._generator,
+            device=self.device,
+        )
+
+    def noise(self, step: int, order: Tensor | None = None) -> Tensor | None:
+        """Standard normal numbers ``(B, n)`` of a step, column by column in memory.
+
+        ``order`` says which trajectories they are for; ``None`` if none are needed.
+        """
+        if self._network.standard_deviation is None:
+            return None
+        if self._common is not None:
+            particle = self._particle if order is None else self._particle[order]
+            return self._common[1][step].index_select(1, particle).t()
+        size = (self._network.observation_dim, self._count)
+        return torch.randn(size, generator=self._generator, device=self.device).t()
+
+
 def _predictor(
     network: PlanningNetwork,
     propagation: Propagation,
     shares: list[int],
     plan: Tensor,
-    horizon: int,
-    generator: torch.Generator | None,
+    draws: _Draws,
 ) -> _Predict:
     """Normalised change ``(B, n)`` from raw inputs ``(B, n + m)`` at a step."""
     k, count = network.members, plan.shape[0]
@@ -233,8 +307,8 @@ def _predictor(
     if propagation == "tsinf":
         candidates = count // sum(shares)
         keeping = ForwardPass(network, [candidates * share for share in shares])
-        return lambda inputs, step: network.sample(keeping(inputs), generator)
-    drawn = torch.randint(k, (horizon, count), generator=generator, device=plan.device)
+        return lambda inputs, step: network.sample(keeping(inputs), draws.noise(step))
+    drawn = draws.members()
     order = drawn.argsort(1)
     sizes = torch.stack([(drawn == member).sum(1) for member in range(k)], 1).tolist()
     memory: dict[tuple[torch.dtype, int], Tensor] = {}
@@ -243,7 +317,7 @@ def _predictor(
         # Rows of the same member next to each other, for as long as the products take.
         raw = ForwardPass(network, sizes[step], memory=memory)(inputs[order[step]])
         result = torch.empty_like(inputs[:, : network.observation_dim])
-        result[order[step]] = network.sample(raw, generator)
+        result[order[step]] = network.sample(raw, draws.noise(step, order[step]))
         return result
 
     return switching
