@@ -47,6 +47,7 @@ def make_plan(
     propagation: Propagation = "tsinf",
     particles: int = PARTICLES,
     generator: torch.Generator | None = None,
+    common_noise: bool = True,
 ) -> Tensor:
     """One plan of ours ``(1, H, m)`` from an observation ``(1, n)``, copy of weights included."""
     sampler = TrajectorySampler(
@@ -55,6 +56,7 @@ def make_plan(
         particles=particles,
         propagation=propagation,
         precision=precision,
+        common_noise=common_noise,
     )
     mean = torch.zeros(1, CONFIG.horizon, model.action_dim)
     evaluate = sampler.evaluator(observation, generator)

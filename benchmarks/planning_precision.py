@@ -37,21 +37,23 @@ def run(repetitions: int) -> list[Row]:
 
     Returns:
         One row per state and one for all: mean returns in ``float32`` and ``bfloat16``,
-        their ``difference`` and its standard ``error``, and both for two plans in float32
-        (``seeds``, ``seeds_error``).
+        with noise of its own for each candidate (``own_noise``, float32); the ``difference`` of
+        the first two and its standard ``error``, and both for two plans in float32 (``seeds``,
+        ``seeds_error``).
     """
     buffer = cheetah.transitions(5000, 500)
     model = cheetah.fitted_model(buffer, planning.GRADIENT_STEPS)
     states = buffer[:]["observation"][:: len(buffer) // PROBLEMS][:PROBLEMS]
     torch.manual_seed(0)
     found: list[list[list[float]]] = []
-    for observation in states.split(1):
+    for problem, observation in enumerate(states.split(1)):
         plans = []
-        for seed in range(repetitions):
-            cases: list[tuple[Precision, int]] = [
-                ("float32", seed),
-                ("bfloat16", seed),
-                ("float32", 10_000 + seed),
+        for seed in range(problem * repetitions, (problem + 1) * repetitions):
+            cases: list[tuple[Precision, int, bool]] = [
+                ("float32", seed, True),
+                ("bfloat16", seed, True),
+                ("float32", 10_000 + seed, True),
+                ("float32", seed, False),
             ]
             plans += [
                 planning.make_plan(
@@ -59,24 +61,26 @@ def run(repetitions: int) -> list[Row]:
                     observation,
                     precision,
                     generator=torch.Generator().manual_seed(number),
+                    common_noise=common,
                 )
-                for precision, number in cases
+                for precision, number, common in cases
             ]
         values = judged(model, observation, plans)
-        found.append([values[first : first + 3] for first in range(0, len(values), 3)])
+        found.append([values[first : first + 4] for first in range(0, len(values), 4)])
     rows = [_row(str(number), values) for number, values in enumerate(found)]
-    return [*rows, _row("all", [triple for values in found for triple in values])]
+    return [*rows, _row("all", [four for values in found for four in values])]
 
 
 def _row(state: str, values: list[list[float]]) -> Row:
-    changes = [low - full for full, low, _ in values]
-    seeds = [other - full for full, _, other in values]
+    changes = [low - full for full, low, _, _ in values]
+    seeds = [other - full for full, _, other, _ in values]
     root = len(values) ** 0.5
     return {
         "state": state,
         "plans": len(values),
-        "float32": fmean(full for full, _, _ in values),
-        "bfloat16": fmean(low for _, low, _ in values),
+        "float32": fmean(full for full, _, _, _ in values),
+        "bfloat16": fmean(low for _, low, _, _ in values),
+        "own_noise": fmean(own for _, _, _, own in values),
         "difference": fmean(changes),
         "error": stdev(changes) / root if len(values) > 1 else float("nan"),
         "seeds": fmean(seeds),
@@ -92,13 +96,15 @@ def table(repetitions: int) -> Table:
         "Expected returns of the plans that the planner of the table above makes in either "
         f"precision with the same random numbers, judged by {PARTICLES} trajectories in float32, "
         "from states of HalfCheetah under random actions; the difference with its standard "
-        "error, and beside it that of two plans in float32 with other random numbers.",
+        "error, and beside it that of two plans in float32 with other random numbers. `own noise` "
+        "are plans in float32 whose candidates do not share random numbers.",
         run(repetitions),
         {
             "state": "state",
             "plans": "plans",
             "float32": "float32",
             "bfloat16": "bfloat16",
+            "own_noise": "float32, own noise",
             "difference": "difference",
             "error": "standard error",
             "seeds": "difference of two in float32",
