@@ -41,7 +41,7 @@ def run(config: DictConfig) -> Path:
     torch.set_num_threads(recipe.threads)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     progress = tqdm(
-        total=config.outer_iterations,
+        total=recipe.outer_iterations,
         desc=f"{recipe.recipe} seed {recipe.seed}",
         unit="iteration",
         disable=None,
@@ -73,7 +73,7 @@ def _run(
         if directory.iterations_done() < len(rows):
             # A kill has come between the checkpoint and the files made from it.
             _write_results(algorithm, directory, rows, timings)
-        if len(rows) >= settings["outer_iterations"]:
+        if len(rows) >= recipe.outer_iterations:
             progress.write(f"{directory.path} is complete: nothing to do")
             return
     run_id = hashlib.sha256(str(directory.path.resolve()).encode()).hexdigest()[:12]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -61,7 +62,7 @@ class WandbSettings:
 
 
 @dataclass
-class RunSettings:
+class RunSettings(ABC):
     """Settings of every recipe; subclasses add those of their algorithm.
 
     Attributes:
@@ -116,13 +117,13 @@ class RunSettings:
         if self.horizon is not None and self.horizon < 1:
             raise ValueError(f"horizon must be at least 1 or null, got {self.horizon}")
 
+    @abstractmethod
     def build(self) -> Algorithm:
         """The algorithm that the recipe describes, fresh.
 
         Raises:
             ValueError: if settings contradict each other.
         """
-        raise NotImplementedError  # a recipe's schema says which algorithm it is
 
 
 # Keys that may differ between a run and its continuation: they do not touch the result.
