@@ -2,7 +2,8 @@
 
 from torchrl_l1.algorithms.collection import Perturbation
 from torchrl_l1.algorithms.metrpo import METRPO
-from torchrl_l1.algorithms.metrpo_config import METRPOConfig, ModelConfig, PolicyConfig
+from torchrl_l1.algorithms.metrpo_config import METRPOConfig, PolicyConfig
+from torchrl_l1.algorithms.model_config import ModelConfig
 from torchrl_l1.algorithms.pets import PETS
 from torchrl_l1.algorithms.pets_config import PETSConfig
 

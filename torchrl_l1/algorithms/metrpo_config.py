@@ -2,57 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import get_args
 
-from torchrl_l1.dynamics import HEADS, MODEL_FORMS, FitConfig
-from torchrl_l1.dynamics.ensemble import ActivationName
+from torchrl_l1.algorithms.checks import check_choice, check_positive, check_widths
+from torchrl_l1.algorithms.model_config import ModelConfig
+from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.objectives import TRPOConfig
-
-
-@dataclass
-class ModelConfig:
-    """The ensemble, see :func:`~torchrl_l1.dynamics.make_dynamics`.
-
-    Attributes:
-        form: ``nonlinear``, or ``affine`` in the action.
-        head: what a member predicts: ``deterministic``, a point, or ``gaussian``, a distribution.
-        members: number of networks.
-        hidden: widths of a nonlinear network's hidden layers; for the control-affine form they
-            are scaled to the same number of parameters.
-        activation: ``relu``, ``tanh`` or ``silu``.
-        std_floor: smallest standard deviation of the normalisers, raw units.
-        box_margin: widening of the box around the data, see
-            :class:`~torchrl_l1.dynamics.DataBox`.
-    """
-
-    form: str = "nonlinear"
-    head: str = "deterministic"
-    members: int = 5
-    hidden: list[int] = field(default_factory=lambda: [256, 256])
-    activation: str = "relu"
-    std_floor: float = 1e-4
-    box_margin: float = 0.5
-
-    def __post_init__(self) -> None:
-        """Refuse settings that could only fail later.
-
-        Raises:
-            ValueError: naming the setting.
-        """
-        _check_choice("model.form", self.form, MODEL_FORMS)
-        _check_choice("model.head", self.head, HEADS)
-        _check_choice("model.activation", self.activation, get_args(ActivationName))
-        if self.members < 1:
-            raise ValueError(f"model.members must be at least 1, got {self.members}")
-        _check_widths("model.hidden", self.hidden)
-        _check_positive("model.std_floor", self.std_floor)
-        if not (self.box_margin >= 0 and math.isfinite(self.box_margin)):
-            raise ValueError(
-                f"model.box_margin must be finite and not negative, got {self.box_margin}"
-            )
 
 
 @dataclass
@@ -78,8 +33,8 @@ class PolicyConfig:
         Raises:
             ValueError: naming the setting.
         """
-        _check_widths("policy.hidden", self.hidden)
-        _check_positive("policy.std", self.std)
+        check_widths("policy.hidden", self.hidden)
+        check_positive("policy.std", self.std)
 
 
 @dataclass
@@ -149,8 +104,8 @@ class METRPOConfig:
         Raises:
             ValueError: naming the setting.
         """
-        _check_choice("label", self.label, ("nominal", "executed"))
-        _check_choice("box_exit", self.box_exit, ("truncate", "fail"))
+        check_choice("label", self.label, ("nominal", "executed"))
+        check_choice("box_exit", self.box_exit, ("truncate", "fail"))
         if self.episode_steps is not None and self.episode_steps < 1:
             raise ValueError(f"episode_steps must be at least 1 or null, got {self.episode_steps}")
         counts = ("outer_iterations", "episodes_per_iteration", "evaluation_episodes")
@@ -178,18 +133,3 @@ def check_clipping(clip_actions: bool, with_l1: bool) -> None:
             "clip_actions=false is for runs without L1: the adaptive controller always keeps "
             "the action within its bounds (use l1=off)"
         )
-
-
-def _check_choice(name: str, value: str, allowed: Sequence[str]) -> None:
-    if value not in allowed:
-        raise ValueError(f"{name} must be {' or '.join(map(repr, allowed))}, got {value!r}")
-
-
-def _check_positive(name: str, value: float) -> None:
-    if not (value > 0 and math.isfinite(value)):
-        raise ValueError(f"{name} must be finite and positive, got {value}")
-
-
-def _check_widths(name: str, widths: Sequence[int]) -> None:
-    if any(width < 1 for width in widths):
-        raise ValueError(f"{name} must hold widths of at least 1, got {list(widths)}")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from torchrl_l1.algorithms.metrpo_config import ModelConfig
+from torchrl_l1.algorithms.checks import check_choice
+from torchrl_l1.algorithms.model_config import ModelConfig
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.planning import CEMConfig, check_sampling
 
@@ -65,8 +66,7 @@ class PETSConfig:
         Raises:
             ValueError: naming the setting.
         """
-        if self.label not in ("nominal", "executed"):
-            raise ValueError(f"label must be 'nominal' or 'executed', got {self.label!r}")
+        check_choice("label", self.label, ("nominal", "executed"))
         for name in ("outer_iterations", "random_episodes", "episodes_per_iteration", "fit_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
