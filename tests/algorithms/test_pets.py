@@ -89,6 +89,15 @@ def test_planner_balances_with_a_model_of_what_is_near_upright() -> None:
 
 
 @pytest.mark.parametrize(
+    ("compile_plans", "plans"), [(False, "eager"), ("auto", "eager"), (True, "compiled")]
+)
+def test_the_log_tells_whether_plans_are_compiled(compile_plans: bool | str, plans: str) -> None:
+    algorithm = make(compile_plans=compile_plans)
+    assert algorithm.choices()["plans"] == plans
+    assert algorithm.policy.sampler.compile == compile_plans
+
+
+@pytest.mark.parametrize(
     ("changes", "culprit"),
     [
         ({"label": "both"}, "label"),
@@ -97,6 +106,8 @@ def test_planner_balances_with_a_model_of_what_is_near_upright() -> None:
         ({"particles": 0}, "particles"),
         ({"propagation": "ts2"}, "propagation"),
         ({"precision": "float16"}, "precision"),
+        ({"compile_plans": "always"}, "compile_plans: compile must be True, False or 'auto'"),
+        ({"compile_plans": True, "propagation": "ts1"}, "compile_plans: propagation 'ts1'"),
         ({"evaluation_episodes": -1}, "evaluation_episodes"),
         ({"episode_steps": 0}, "episode_steps"),
         ({"head": "laplace"}, "model.head"),

@@ -23,6 +23,15 @@ from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError,
 
 Recipe = Callable[..., DictConfig]
 
+METRPO_RUN = ["outer_iterations=6", "fit.max_epochs=150", "fit.patience=150"]
+# Two rounds of shooting, two of cloning, two of fine-tuning.
+MBMF_RUN = [
+    *("outer_iterations=6", "shooting_iterations=2", "cloning.iterations=2", "horizon=10"),
+    *("shooting_episodes=2", "tuning.episodes=2", "tuning.minibatches=2", "evaluation_episodes=2"),
+    *("shooting.candidates=16", "shooting.horizon=4", "model.hidden=[8]", "fit.max_epochs=20"),
+    *("cloning.max_epochs=20", "tuning.epochs=20", "wandb.mode=disabled"),
+]
+
 
 def snapshot(folder: Path) -> dict[str, bytes]:
     return {
@@ -242,14 +251,25 @@ def test_interrupted_write_leaves_the_old_file(
     assert torch.load(file, weights_only=True) == {"iteration": 1}
 
 
-def test_killed_run_resumes_to_the_same_metrics(tmp_path: Path, tiny_overrides: list[str]) -> None:
-    command = [
-        *(sys.executable, "-m", "torchrl_l1.cli", "run", "metrpo/inverted_pendulum"),
-        *tiny_overrides,
-        "outer_iterations=6",
-        "fit.max_epochs=150",
-        "fit.patience=150",
-    ]
+@pytest.mark.parametrize(
+    ("recipe", "overrides", "rows_before_kill"),
+    [
+        # Before the first checkpoint, then twice at a random moment of a later iteration.
+        ("metrpo/inverted_pendulum", METRPO_RUN, (0, 1, 3)),
+        # Once in each stage.
+        ("mbmf/inverted_pendulum", MBMF_RUN, (1, 3, 5)),
+    ],
+    ids=["metrpo", "mbmf"],
+)
+def test_killed_run_resumes_to_the_same_metrics(
+    tmp_path: Path,
+    tiny_overrides: list[str],
+    recipe: str,
+    overrides: list[str],
+    rows_before_kill: tuple[int, ...],
+) -> None:
+    tiny = tiny_overrides if recipe.startswith("metrpo") else []
+    command = [sys.executable, "-m", "torchrl_l1.cli", "run", recipe, *tiny, *overrides]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
 
     def start(folder: Path) -> subprocess.Popen[bytes]:
@@ -264,10 +284,9 @@ def test_killed_run_resumes_to_the_same_metrics(tmp_path: Path, tiny_overrides: 
     assert start(unbroken).wait(timeout=300) == 0
     iteration = mean_seconds(unbroken)
     rng = random.Random(0)
-    # Before the first checkpoint, then twice at a random moment of a later iteration.
-    for rows_before_kill in (0, 1, 3):
+    for count in rows_before_kill:
         process = start(killed)
-        while process.poll() is None and not reached(killed, rows_before_kill):
+        while process.poll() is None and not reached(killed, count):
             time.sleep(0.002)
         time.sleep(rng.uniform(0, iteration))
         process.send_signal(signal.SIGKILL)

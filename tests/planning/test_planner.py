@@ -18,6 +18,7 @@ from torchrl_l1.planning import (
     MPPIConfig,
     ShootingConfig,
     TrajectorySampler,
+    planner,
 )
 
 CONFIG = CEMConfig(horizon=4, candidates=24, elites=4, iterations=2)
@@ -260,6 +261,55 @@ def test_the_model_is_referred_to_and_seen_to_change():
     with torch.no_grad():
         controller.sampler.dynamics.network.weights[0].neg_()
     assert not torch.equal(act(controller), before)
+
+
+@pytest.mark.parametrize("config", [CONFIG, MPPIConfig(4, 24), ShootingConfig(4, 24)])
+def test_plans_for_observations_are_those_of_fresh_environments(config):
+    controller, observation = make_controller(config, low=-1.0), torch.randn(5, 4)
+
+    def seeded():
+        controller.generator = torch.Generator().manual_seed(0)
+        return controller
+
+    data = seeded()(fresh(controller, (5,), observation=observation))
+    plan = seeded().plan(observation)
+    assert torch.equal(plan.actions[:, 0], data["action"])
+    assert torch.equal(plan.best_return[:, None], data["next", "plan", "best_return"])
+    again = seeded().plan(observation.double(), torch.ones(5, 4, 1))
+    assert torch.equal(again.actions, plan.actions)  # one is the middle of the bounds
+
+
+def test_many_observations_are_planned_for_in_portions(monkeypatch):
+    # Two environments at a time: 50 candidates of 4 actions each.
+    monkeypatch.setattr(planner, "_PORTION", 2 * 50 * 4 + 1)
+    controller, recorder = recorded()
+    observation, start = torch.randn(5, 4), torch.rand(5, 4, 1)
+    plan = controller.plan(observation, start)
+    assert [len(portion) for portion in recorder.observations] == [2, 2, 1]
+    assert torch.equal(torch.cat(recorder.observations), observation)
+    assert torch.equal(torch.cat(recorder.first), start)
+    assert plan.actions.shape == (5, 4, 1) and plan.best_return.shape == (5,)
+    torch.testing.assert_close(plan.actions.sum((1, 2)), plan.best_return)
+
+
+def test_plans_of_bad_observations():
+    controller = make_controller()
+    observation = torch.randn(3, 4)
+    observation[1] = math.nan
+    plan = controller.plan(observation, torch.full((3, 4, 1), 0.5))
+    assert torch.isneginf(plan.best_return).tolist() == [False, True, False]
+    assert (plan.actions[1] == 0.5).all() and (plan.actions[[0, 2]] != 0.5).any()
+    for wrong in (torch.zeros(3, 5), torch.zeros(4), torch.zeros(0, 4), torch.zeros(())):
+        with pytest.raises(ValueError, match=r"observation must have shape \(N, 4\) with at least"):
+            controller.plan(wrong)
+    for wrong in (torch.zeros(3, 4), torch.zeros(2, 4, 1), torch.zeros(3, 5, 1)):
+        with pytest.raises(ValueError, match=r"start must have shape \(3, 4, 1\) for these"):
+            controller.plan(torch.zeros(3, 4), wrong)
+    controller.sampler = TrajectorySampler(
+        controller.sampler.dynamics, lambda x, u, successor: x[..., 0] + math.nan
+    )
+    with pytest.raises(ValueError, match="the reward function gives nan at the observation"):
+        controller.plan(torch.zeros(3, 4))
 
 
 def test_bad_settings_are_named():

@@ -243,6 +243,26 @@ def test_a_terminated_particle_earns_nothing_more(linear):
         assert returns(breaks_at(3.5, value)) == -math.inf
 
 
+def test_later_rewards_count_less(linear):
+    # x' = x + u, from 0: 1, 2, 3, 4.
+    model = linear([[[0.0]]], [[[1.0]]])
+    x, actions = torch.zeros(1, 1), torch.ones(1, 1, 4, 1)
+
+    def paid(x, u, successor):
+        return successor[..., 0]
+
+    def returns(discount, **settings):
+        sampler = TrajectorySampler(
+            model, paid, particles=2, precision="float32", discount=discount, **settings
+        )
+        return sampler.evaluator(x)(actions).item()
+
+    assert returns(0.5) == pytest.approx(1 + 2 / 2 + 3 / 4 + 4 / 8, abs=1e-3)
+    assert returns(0.5, terminated=lambda s: s[..., 0] > 1.5) == pytest.approx(1 + 2 / 2, abs=1e-3)
+    assert returns(1e-30) == pytest.approx(1, abs=1e-3)  # powers that float32 cannot hold
+    assert returns(1.0) == evaluate(model, x, actions, paid, particles=2).item()
+
+
 def test_a_state_that_is_not_finite_is_never_worth_anything(linear):
     # Doubling 30 times per step overflows; the reward does not look at the state.
     model = linear([[[1e9]], [[0.0]]], [[[1.0]], [[1.0]]])
@@ -322,12 +342,17 @@ def test_bad_input_is_named():
     check("precision must be", precision="half")
     check("particles and block must be positive", particles=0)
     check("particles and block must be positive", block=0)
+    for discount in (0.0, 1.01, math.nan):
+        check(rf"discount must be in \(0, 1\], got {discount}", discount=discount)
+    check("compile must be True, False or 'auto', got 'yes'", compile="yes")
     check("the reward function must return", reward=lambda x, u, s: s[..., :1])
     check("the terminated function must return", terminated=lambda s: s[..., :1] > 0)
     for wrong, message in (
         ({"particles": 0}, "must be positive"),
         ({"propagation": "all"}, "propagation must be"),
         ({"precision": "double"}, "precision must be"),
+        ({"discount": 0}, "discount must be"),
+        ({"compile": True, "propagation": "ts1"}, "'ts1' cannot be compiled, .* set compile to"),
     ):
         with pytest.raises(ValueError, match=message):
             TrajectorySampler(model, curved_reward, **wrong)

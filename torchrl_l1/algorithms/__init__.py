@@ -1,6 +1,8 @@
 """Model-based reinforcement learning algorithms, one readable loop each."""
 
 from torchrl_l1.algorithms.collection import Perturbation
+from torchrl_l1.algorithms.mbmf import MBMF
+from torchrl_l1.algorithms.mbmf_config import CloningConfig, MBMFConfig, TuningConfig
 from torchrl_l1.algorithms.metrpo import METRPO
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig, PolicyConfig
 from torchrl_l1.algorithms.model_config import ModelConfig
@@ -8,11 +10,15 @@ from torchrl_l1.algorithms.pets import PETS
 from torchrl_l1.algorithms.pets_config import PETSConfig
 
 __all__ = [
+    "MBMF",
     "METRPO",
     "PETS",
+    "CloningConfig",
+    "MBMFConfig",
     "METRPOConfig",
     "ModelConfig",
     "PETSConfig",
     "Perturbation",
     "PolicyConfig",
+    "TuningConfig",
 ]

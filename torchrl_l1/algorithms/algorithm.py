@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
-from torchrl_l1.algorithms.collection import Collection
+from tensordict.nn import TensorDictModuleBase
+
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.envs import Task
 
@@ -23,20 +24,25 @@ class Algorithm(Protocol):
     """A model-based algorithm and its state.
 
     Attributes:
-        stochastic: whether acting with sampled actions and with mean actions differ.
         iteration: outer iterations that are complete.
         task: what it learns.
-        collection: the real environments that it learns in, with the policy that acts in them.
-        acting_dynamics: the model that L1 uses there, on the CPU.
+        acting_dynamics: the model that L1 uses in real environments, on the CPU.
         on_phase: called with a word on what is going on, for progress bars.
     """
 
-    stochastic: ClassVar[bool]
     iteration: int
     task: Task
-    collection: Collection
     acting_dynamics: EnsembleDynamics
     on_phase: Callable[[str], None]
+
+    @property
+    def policies(self) -> Mapping[str, TensorDictModuleBase]:
+        """What acts in real environments, by the names of the stages that they come from.
+
+        In the order in which they come about, and only what has been learned so far; the last one
+        is the algorithm's result.
+        """
+        ...
 
     def iterate(self) -> Iterator[IterationResult]:
         """Run the outer iterations that are left, reporting after each."""

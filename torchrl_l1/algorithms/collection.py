@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import Collector
+from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase, RewardSum, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_type
 
@@ -136,10 +137,14 @@ class Collection:
         )
         return iter(collector)
 
-    def random(self, seed: int) -> TensorDictBase:
-        """Episodes ``[N, T]`` of uniformly random actions."""
+    def random(self, seed: int, bounds: tuple[float, float] | None = None) -> TensorDictBase:
+        """Episodes ``[N, T]`` of actions uniform between ``bounds``; those of the task if none."""
         env = self._bare_env()
-        batches = self._batches(env, RandomPolicy(env.full_action_spec))
+        spec = env.full_action_spec
+        if bounds is not None:
+            shape = env.action_spec.shape
+            spec = Composite(action=Bounded(*bounds, shape=shape, dtype=torch.float32))
+        batches = self._batches(env, RandomPolicy(spec))
         _seed(env, seed, "random")
         return _with_executed(next(batches))
 

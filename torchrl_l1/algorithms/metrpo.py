@@ -8,14 +8,15 @@ the algorithm does not know of it (arXiv 2403.14860, algorithm 2).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from copy import deepcopy
 from functools import partial
 from itertools import pairwise
 from time import perf_counter
-from typing import Any, ClassVar
+from typing import Any
 
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 
 from torchrl_l1.algorithms.algorithm import IterationResult
 from torchrl_l1.algorithms.collection import (
@@ -60,8 +61,6 @@ class METRPO:
     Raises:
         ValueError: if L1 is on and ``clip_actions`` is off.
     """
-
-    stochastic: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -168,6 +167,11 @@ class METRPO:
             **return_metrics(sampled),
             "return_deterministic": mean_action.mean().item(),
         }
+
+    @property
+    def policies(self) -> Mapping[str, TensorDictModuleBase]:
+        """What acts in real environments: the policy, its actions clipped if settings say so."""
+        return {"policy": self.collection.policy}
 
     def choices(self) -> dict[str, str]:
         """Where models are fitted and trajectories imagined."""

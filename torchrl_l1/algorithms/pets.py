@@ -9,14 +9,15 @@ what is learned is the model. With L1 on, the adaptive controller augments the p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from copy import deepcopy
 from functools import partial
 from itertools import pairwise
 from time import perf_counter
-from typing import Any, ClassVar
+from typing import Any
 
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 
 from torchrl_l1.algorithms.algorithm import IterationResult
 from torchrl_l1.algorithms.collection import (
@@ -35,7 +36,12 @@ from torchrl_l1.control import L1Config
 from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.dynamics import make_dynamics
 from torchrl_l1.envs import get_task
-from torchrl_l1.planning import ModelPredictiveController, TrajectorySampler, resolve_precision
+from torchrl_l1.planning import (
+    ModelPredictiveController,
+    TrajectorySampler,
+    resolve_compilation,
+    resolve_precision,
+)
 
 METRICS: dict[str, str] = {
     **COMMON,
@@ -68,8 +74,6 @@ class PETS:
         on_phase: called with a word on what is going on, for progress bars.
     """
 
-    stochastic: ClassVar[bool] = False
-
     def __init__(
         self,
         task: str,
@@ -99,6 +103,7 @@ class PETS:
             config.propagation,  # type: ignore[arg-type]
             config.precision,  # type: ignore[arg-type]
             config.common_noise,
+            compile=config.compile_plans,  # type: ignore[arg-type]
         )
         self.policy = ModelPredictiveController(
             sampler,
@@ -177,12 +182,20 @@ class PETS:
         returns = return_metrics(data)
         return {**returns, "return_deterministic": episode_returns(data).mean().item()}
 
+    @property
+    def policies(self) -> Mapping[str, TensorDictModuleBase]:
+        """What acts in real environments: the planner."""
+        return {"planner": self.policy}
+
     def choices(self) -> dict[str, str]:
-        """Where plans are made, and in which precision."""
+        """Where plans are made, in which precision, and whether compiled."""
         hidden = self.dynamics.network.weights[:-1]
         width = min((weight.shape[2] for weight in hidden), default=0)
         precision = resolve_precision(self.config.precision, self.device, width)
-        return {"device": str(self.device), "precision": precision}
+        config = self.config
+        fused = resolve_compilation(config.compile_plans, self.device, config.propagation)
+        plans = "compiled" if fused else "eager"
+        return {"device": str(self.device), "precision": precision, "plans": plans}
 
     def weights(self) -> dict[str, dict[str, Any]]:
         """State dict of the model: there is nothing else."""

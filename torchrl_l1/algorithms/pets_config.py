@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from torchrl_l1.algorithms.checks import check_choice
 from torchrl_l1.algorithms.model_config import ModelConfig
 from torchrl_l1.dynamics import FitConfig
-from torchrl_l1.planning import CEMConfig, check_sampling
+from torchrl_l1.planning import CEMConfig, check_sampling, resolve_compilation
 
 
 @dataclass
@@ -36,6 +36,9 @@ class PETSConfig:
             noise in an iteration of the planner.
         precision: of the hidden layers in planning: ``float32``, ``bfloat16``, or ``auto`` for
             what the processor multiplies fastest.
+        compile_plans: whether to compile the motion of the imagined trajectories: ``true``,
+            ``false``, or ``auto`` for ``true`` on a GPU with a working compiler, see
+            :func:`~torchrl_l1.planning.resolve_compilation`.
         label: action that the model is fitted to: ``nominal`` is the planner's, ``executed`` what
             L1 sends to the actuators.
         cem: see :class:`~torchrl_l1.planning.CEMConfig`.
@@ -55,6 +58,7 @@ class PETSConfig:
     propagation: str = "tsinf"
     common_noise: bool = True
     precision: str = "auto"
+    compile_plans: bool | str = "auto"
     label: str = "executed"
     cem: CEMConfig = field(default_factory=CEMConfig)
     model: ModelConfig = field(default_factory=lambda: ModelConfig(head="gaussian"))
@@ -84,3 +88,7 @@ class PETSConfig:
                 f"{self.replan_every}"
             )
         check_sampling(self.particles, self.propagation, self.precision)
+        try:
+            resolve_compilation(self.compile_plans, propagation=self.propagation)
+        except ValueError as error:
+            raise ValueError(f"compile_plans: {error}") from error

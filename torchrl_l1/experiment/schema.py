@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
-from torchrl_l1.algorithms import METRPO, PETS, METRPOConfig, PETSConfig
+from torchrl_l1.algorithms import MBMF, METRPO, PETS, MBMFConfig, METRPOConfig, PETSConfig
 from torchrl_l1.algorithms.metrpo_config import check_clipping
 from torchrl_l1.experiment.settings import RunSettings, compile_mode, flatten, l1_config
 
@@ -69,7 +69,31 @@ class PETSRecipe(PETSConfig, RunSettings):
         return PETS(self.task, _part(self, PETSConfig), **_surroundings(self))
 
 
-SCHEMAS: dict[str, type[RunSettings]] = {"metrpo": METRPORecipe, "pets": PETSRecipe}
+@dataclass
+class MBMFRecipe(MBMFConfig, RunSettings):
+    """An MBMF recipe: run settings and the algorithm's own, side by side."""
+
+    algorithm: str = "mbmf"
+
+    def __post_init__(self) -> None:
+        """Check both parts.
+
+        Raises:
+            ValueError: naming the setting.
+        """
+        RunSettings.__post_init__(self)
+        MBMFConfig.__post_init__(self)
+
+    def build(self) -> MBMF:
+        """The algorithm, fresh."""
+        return MBMF(self.task, _part(self, MBMFConfig), **_surroundings(self))
+
+
+SCHEMAS: dict[str, type[RunSettings]] = {
+    "metrpo": METRPORecipe,
+    "pets": PETSRecipe,
+    "mbmf": MBMFRecipe,
+}
 """Schema of the recipes of each algorithm. In a recipe's defaults it is ``<name>_recipe``."""
 
 

@@ -2,19 +2,16 @@
 
 from torchrl_l1.planning.cem import CEMConfig
 from torchrl_l1.planning.cem import plan as plan_cem
+from torchrl_l1.planning.compiled_motion import resolve_compilation
 from torchrl_l1.planning.mppi import MPPIConfig
 from torchrl_l1.planning.mppi import plan as plan_mppi
 from torchrl_l1.planning.network import PlanningNetwork, Precision, resolve_precision
+from torchrl_l1.planning.particle_motion import Propagation
 from torchrl_l1.planning.planner import ModelPredictiveController
+from torchrl_l1.planning.random_shooting import ShootingConfig
+from torchrl_l1.planning.random_shooting import plan as plan_shooting
 from torchrl_l1.planning.sequences import Evaluate, Plan
-from torchrl_l1.planning.shooting import ShootingConfig
-from torchrl_l1.planning.shooting import plan as plan_shooting
-from torchrl_l1.planning.trajectory_sampling import (
-    Propagation,
-    TrajectorySampler,
-    check_sampling,
-    evaluate,
-)
+from torchrl_l1.planning.trajectory_sampling import TrajectorySampler, check_sampling, evaluate
 
 __all__ = [
     "CEMConfig",
@@ -32,5 +29,6 @@ __all__ = [
     "plan_cem",
     "plan_mppi",
     "plan_shooting",
+    "resolve_compilation",
     "resolve_precision",
 ]

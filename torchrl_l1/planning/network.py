@@ -216,13 +216,20 @@ class ForwardPass:
                 if operand is not units:
                     operand.copy_(units)
                 torch.mm(operand, weight, out=out)
-        raw = self._out.float()
-        if self._width == inputs.shape[1]:
-            return raw
-        # A control-affine model: the network sees the observation and gives offset and gain.
-        action = inputs[:, self._width :].repeat(self._copies, 1)
-        parts = raw.unflatten(1, (1 + action.shape[1], -1))
-        return parts[:, 0] + (parts[:, 1:] * action[:, :, None]).sum(1)
+        return affine_output(self._out.float(), inputs[:, self._width :].repeat(self._copies, 1))
+
+
+def affine_output(raw: Tensor, action: Tensor) -> Tensor:
+    """Raw output of a control-affine model, whose network gives offset and gain.
+
+    Args:
+        raw: the network's output ``(..., (1 + m) out)``, or what is returned if m is zero.
+        action: what the network has not seen, ``(..., m)``.
+    """
+    if action.shape[-1] == 0:
+        return raw
+    parts = raw.unflatten(-1, (1 + action.shape[-1], -1))
+    return parts[..., 0, :] + (parts[..., 1:, :] * action[..., None]).sum(-2)
 
 
 _Layer = tuple[Tensor, Tensor, Tensor, Tensor]

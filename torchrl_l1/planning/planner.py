@@ -13,11 +13,11 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
-from torchrl_l1.planning import cem, mppi, shooting
+from torchrl_l1.planning import cem, mppi, random_shooting
 from torchrl_l1.planning.cem import CEMConfig
 from torchrl_l1.planning.mppi import MPPIConfig
+from torchrl_l1.planning.random_shooting import ShootingConfig
 from torchrl_l1.planning.sequences import Plan, checked_bounds
-from torchrl_l1.planning.shooting import ShootingConfig
 from torchrl_l1.planning.trajectory_sampling import TrajectorySampler
 
 OptimizerConfig = CEMConfig | MPPIConfig | ShootingConfig
@@ -28,8 +28,11 @@ PLAN_KEY = "plan"
 _OPTIMIZERS: dict[type, Callable[..., Plan]] = {
     CEMConfig: cem.plan,
     MPPIConfig: mppi.plan,
-    ShootingConfig: shooting.plan,
+    ShootingConfig: random_shooting.plan,
 }
+
+# Numbers in the candidates of the environments that are planned for together, at most (64 MiB).
+_PORTION = 2**24
 
 
 class ModelPredictiveController(TensorDictModuleBase):
@@ -133,6 +136,54 @@ class ModelPredictiveController(TensorDictModuleBase):
     make_tensordict_primer = make_primer
 
     @torch.no_grad()
+    def plan(self, observation: Tensor, start: Tensor | None = None) -> Plan:
+        """Plans for many observations at once, without state: each is planned for as if reset.
+
+        Many observations are planned for in portions, so that memory stays bounded.
+
+        Args:
+            observation: ``(N, n)``.
+            start: sequences to start from ``(N, H, m)``; the middle of the bounds if ``None``.
+
+        Returns:
+            The plans, float32, on the model's device. Where an observation is not finite the plan
+            is what it started from.
+
+        Raises:
+            ValueError: for no observations, wrong shapes, or a reward that is not finite where the
+                system is.
+        """
+        dynamics = self.sampler.dynamics
+        count, width = observation.shape[0] if observation.dim() else 0, dynamics.observation_dim
+        if count == 0 or observation.shape != (count, width):
+            raise ValueError(
+                f"ModelPredictiveController.plan: observation must have shape (N, {width}) with at "
+                f"least one row, got {tuple(observation.shape)}"
+            )
+        shape = (count, self.config.horizon, dynamics.action_dim)
+        if start is None:
+            start = self._middle().expand(shape)
+        if start.shape != shape:
+            raise ValueError(
+                f"ModelPredictiveController.plan: start must have shape {shape} for these "
+                f"observations and settings, got {tuple(start.shape)}"
+            )
+        optimize, device = _OPTIMIZERS[type(self.config)], dynamics.device
+        observation, start = (part.to(device, torch.float32) for part in (observation, start))
+        portion = max(1, _PORTION // (self.config.candidates * shape[1] * shape[2]))
+        plans = []
+        for x, mean in zip(observation.split(portion), start.split(portion), strict=True):
+            evaluate = self.sampler.evaluator(x, self.generator)
+            bounds = self.action_low, self.action_high
+            planned = optimize(evaluate, mean, *bounds, self.config, self.generator)
+            self._check_reward(x, mean[:, 0], planned.best_return)
+            plans.append(planned)
+        return Plan(*map(torch.cat, zip(*plans, strict=True)))
+
+    def _middle(self) -> Tensor:
+        return ((self.action_low + self.action_high) / 2).to(self.sampler.dynamics.device)
+
+    @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Act, and plan where it is time to, see the class."""
         batch = tensordict.batch_size
@@ -148,19 +199,11 @@ class ModelPredictiveController(TensorDictModuleBase):
         restarted = tensordict.get(self.init_key, None)
         if restarted is not None:
             step = torch.where(restarted.reshape(count).to(device), 0, step)
-        middle = ((self.action_low + self.action_high) / 2).to(device)
+        middle = self._middle()
         sequence = torch.where((step == 0)[:, None, None], middle, mean)
         due = (step % self.replan_every == 0).nonzero()[:, 0]
         if due.shape[0] > 0:
-            planned = _OPTIMIZERS[type(self.config)](
-                self.sampler.evaluator(flat[due], self.generator),
-                sequence[due],
-                self.action_low,
-                self.action_high,
-                self.config,
-                self.generator,
-            )
-            self._check_reward(flat[due], sequence[due, 0], planned.best_return)
+            planned = self.plan(flat[due], sequence[due])
             sequence = sequence.index_copy(0, due, planned.actions)
             best_return = best_return.index_copy(0, due, planned.best_return[:, None])
         following = {

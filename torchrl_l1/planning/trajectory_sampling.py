@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil
-from typing import Literal, get_args
+from typing import get_args
 
 import torch
 from torch import Tensor
 
+from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.dynamics import EnsembleDynamics
-from torchrl_l1.planning.network import (
-    ForwardPass,
-    PlanningNetwork,
-    Precision,
-    resolve_precision,
-)
+from torchrl_l1.planning.compiled_motion import compiled_predictor, resolve_compilation
+from torchrl_l1.planning.imagined_returns import RewardFunction, Termination, imagined_returns
+from torchrl_l1.planning.network import PlanningNetwork, Precision, resolve_precision
+from torchrl_l1.planning.particle_draws import Draws, scenarios
+from torchrl_l1.planning.particle_motion import Propagation, predictor, shares
 from torchrl_l1.planning.sequences import Evaluate
-
-Propagation = Literal["ts1", "tsinf", "mean"]
-RewardFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
-Termination = Callable[[Tensor], Tensor]
 
 # Trajectories that go through the horizon together: enough of them to make little of what a call
 # costs, and no more than a processor's caches hold. Elsewhere it only bounds the memory.
 _CPU_BLOCK = 8000
 _OTHER_BLOCK = 131_072
-
-_Predict = Callable[[Tensor, int], Tensor]
 
 
 @torch.no_grad()
@@ -44,9 +37,11 @@ def evaluate(
     common_noise: bool = False,
     precision: Precision = "float32",
     block: int | None = None,
+    discount: float = 1.0,
+    compile: CompileMode = False,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    r"""Mean over particles of the undiscounted sum of imagined rewards.
+    r"""Mean over particles of the discounted sum of imagined rewards.
 
     How a particle travels (arXiv 1805.12114, section 5):
 
@@ -78,14 +73,18 @@ def evaluate(
         precision: of the hidden layers, see :class:`PlanningNetwork`.
         block: trajectories that go through the horizon together; ``None`` fits a processor's
             cache, or takes them all on other devices.
+        discount: the reward of step :math:`t = 0, 1, \ldots` counts ``discount**t`` times.
+        compile: whether to compile the motion of the particles, see
+            :func:`~torchrl_l1.planning.resolve_compilation`. Eager and compiled returns are
+            equal up to rounding.
         generator: source of randomness; torch's global one if ``None``.
 
     Returns:
         returns ``(N, C)``, float32.
 
     Raises:
-        ValueError: for shapes that do not fit the model, unknown propagation, or a reward or
-            termination of the wrong shape.
+        ValueError: for shapes that do not fit the model, unknown propagation, a discount outside
+            (0, 1], ``"ts1"`` compiled, or a reward or termination of the wrong shape.
 
     Examples:
         >>> model = EnsembleDynamics(3, 1, members=5, hidden=(8,))
@@ -98,7 +97,7 @@ def evaluate(
         ... ).shape
         torch.Size([2, 7])
     """
-    check_sampling(particles, propagation, precision, block)
+    check_sampling(particles, propagation, precision, block, discount, compile)
     if not isinstance(dynamics, PlanningNetwork):
         dynamics = PlanningNetwork.from_dynamics(dynamics, precision)
     network = dynamics
@@ -109,25 +108,29 @@ def evaluate(
     total = torch.zeros(count, device=sequences.device)
     if block is None:
         block = _CPU_BLOCK if sequences.device.type == "cpu" else _OTHER_BLOCK
-    shares = _shares(network, particles, propagation)
-    rows = network.members if propagation == "mean" else sum(shares)
+    each = shares(network, particles, propagation)
+    rows = network.members if propagation == "mean" else sum(each)
+    fused = resolve_compilation(compile, sequences.device, propagation)
     common = None
     if common_noise and propagation != "mean":
-        common = _scenarios(network, particles, horizon, generator, start)
+        common = scenarios(network, particles, horizon, generator, start)
     blocks = ceil(count * rows / block)
     size = max(1, ceil(count / blocks))
     for first in range(0, count, size):
         plans = sequences[first : first + size]
         own = torch.arange(plans.shape[0], device=plans.device)
         # Sorted by member, then by candidate.
-        plan = torch.cat([own.repeat_interleave(share) for share in shares])
+        plan = torch.cat([own.repeat_interleave(share) for share in each])
         x = start[(first + plan) // actions.shape[1]]
         u = plans.permute(1, 2, 0)[..., plan].transpose(1, 2)
-        draws = _Draws(network, shares, plan.shape[0], horizon, common, generator)
-        predict = _predictor(network, propagation, shares, plan, draws)
-        returns = _rollout(network, predict, x, u, reward, terminated)
+        draws = Draws(network, each, plan.shape[0], horizon, common, generator)
+        if fused:
+            predict = compiled_predictor(network, propagation, each, draws, compile)
+        else:
+            predict = predictor(network, propagation, each, plan.shape[0], draws)
+        returns = imagined_returns(network, predict, x, u, reward, terminated, discount)
         total[first : first + size].index_add_(0, plan, returns)
-    mean = total / sum(shares)
+    mean = total / sum(each)
     return torch.where(torch.isfinite(mean), mean, -torch.inf).reshape(actions.shape[:2])
 
 
@@ -146,9 +149,12 @@ class TrajectorySampler:
         common_noise: here on by default.
         precision: ``"auto"``, ``"float32"`` or ``"bfloat16"``.
         block: trajectories that go through the horizon together.
+        discount: of the rewards, per step.
+        compile: ``True``, ``False``, or ``"auto"`` for what is faster.
 
     Raises:
-        ValueError: for an unknown propagation or precision, or no particles.
+        ValueError: for an unknown propagation, precision or mode of compilation, no particles, a
+            discount outside (0, 1], or ``"ts1"`` compiled.
     """
 
     dynamics: EnsembleDynamics
@@ -159,10 +165,19 @@ class TrajectorySampler:
     precision: Precision = "auto"
     common_noise: bool = True
     block: int | None = None
+    discount: float = 1.0
+    compile: CompileMode = False
 
     def __post_init__(self) -> None:
         """Refuse settings that could only fail later."""
-        check_sampling(self.particles, self.propagation, self.precision, self.block)
+        check_sampling(
+            self.particles,
+            self.propagation,
+            self.precision,
+            self.block,
+            self.discount,
+            self.compile,
+        )
 
     def evaluator(self, observation: Tensor, generator: torch.Generator | None = None) -> Evaluate:
         """Returns ``(N, C)`` of sequences ``(N, C, H, m)`` from observations ``(N, n)``."""
@@ -179,6 +194,8 @@ class TrajectorySampler:
                 terminated=self.terminated,
                 common_noise=self.common_noise,
                 block=self.block,
+                discount=self.discount,
+                compile=self.compile,
                 generator=generator,
             )
 
@@ -186,7 +203,12 @@ class TrajectorySampler:
 
 
 def check_sampling(
-    particles: int, propagation: str, precision: str = "float32", block: int | None = None
+    particles: int,
+    propagation: str,
+    precision: str = "float32",
+    block: int | None = None,
+    discount: float = 1.0,
+    compile: bool | str = False,
 ) -> None:
     """Refuse settings of :func:`evaluate` that make no sense.
 
@@ -198,6 +220,9 @@ def check_sampling(
         raise ValueError(f"propagation must be one of {get_args(Propagation)}, got {propagation!r}")
     if particles < 1 or (block is not None and block < 1):
         raise ValueError(f"particles and block must be positive, got {particles} and {block}")
+    if not 0 < discount <= 1:
+        raise ValueError(f"discount must be in (0, 1], got {discount}")
+    resolve_compilation(compile, propagation=propagation)
 
 
 def _check_shapes(network: PlanningNetwork, observation: Tensor, actions: Tensor) -> None:
@@ -215,150 +240,3 @@ def _check_shapes(network: PlanningNetwork, observation: Tensor, actions: Tensor
         )
     if 0 in actions.shape:
         raise ValueError(f"there is nothing to evaluate in actions of shape {tuple(actions.shape)}")
-
-
-def _shares(network: PlanningNetwork, particles: int, propagation: Propagation) -> list[int]:
-    """Particles of each member; of no member in particular unless it is kept."""
-    if propagation == "tsinf":
-        return [len(range(member, particles, network.members)) for member in range(network.members)]
-    return [1 if propagation == "mean" else particles]
-
-
-_Scenarios = tuple[Tensor, Tensor]
-
-
-def _scenarios(
-    network: PlanningNetwork,
-    particles: int,
-    horizon: int,
-    generator: torch.Generator | None,
-    like: Tensor,
-) -> _Scenarios:
-    """What the particles of all candidates draw: members ``(H, P)`` and noise ``(H, n, P)``."""
-    size, device = (horizon, network.observation_dim, particles), like.device
-    members = torch.randint(
-        network.members, (horizon, particles), generator=generator, device=device
-    )
-    return members, torch.randn(size, generator=generator, device=device)
-
-
-class _Draws:
-    """Random numbers of B trajectories, sorted by member, candidate and particle."""
-
-    def __init__(
-        self,
-        network: PlanningNetwork,
-        shares: list[int],
-        count: int,
-        horizon: int,
-        common: _Scenarios | None,
-        generator: torch.Generator | None,
-    ) -> None:
-        self._network, self._count, self._horizon = network, count, horizon
-        self._common, self._generator = common, generator
-        self.device = network.bias.device
-        if common is not None:
-            every = torch.arange(sum(shares), device=self.device).split(shares)
-            candidates = count // sum(shares)
-            self._particle = torch.cat([own.repeat(candidates) for own in every])
-
-    def members(self) -> Tensor:
-        """A member for every step and trajectory ``(H, B)``."""
-        if self._common is not None:
-            return self._common[0][:, self._particle]
-        return torch.randint(
-            self._network.members,
-            (self._horizon, self._count),
-            generator=self._generator,
-            device=self.device,
-        )
-
-    def noise(self, step: int, order: Tensor | None = None) -> Tensor | None:
-        """Standard normal numbers ``(B, n)`` of a step, column by column in memory.
-
-        ``order`` says which trajectories they are for; ``None`` if none are needed.
-        """
-        if self._network.standard_deviation is None:
-            return None
-        if self._common is not None:
-            particle = self._particle if order is None else self._particle[order]
-            return self._common[1][step].index_select(1, particle).t()
-        size = (self._network.observation_dim, self._count)
-        return torch.randn(size, generator=self._generator, device=self.device).t()
-
-
-def _predictor(
-    network: PlanningNetwork,
-    propagation: Propagation,
-    shares: list[int],
-    plan: Tensor,
-    draws: _Draws,
-) -> _Predict:
-    """Normalised change ``(B, n)`` from raw inputs ``(B, n + m)`` at a step."""
-    k, count = network.members, plan.shape[0]
-    if propagation == "mean":
-        everyone = ForwardPass(network, [count] * k, shared=True)
-
-        def mean(inputs: Tensor, step: int) -> Tensor:
-            changes = everyone(inputs)[:, : network.observation_dim]
-            return changes.unflatten(0, (k, count)).mean(0)
-
-        return mean
-    if propagation == "tsinf":
-        candidates = count // sum(shares)
-        keeping = ForwardPass(network, [candidates * share for share in shares])
-        return lambda inputs, step: network.sample(keeping(inputs), draws.noise(step))
-    drawn = draws.members()
-    order = drawn.argsort(1)
-    sizes = torch.stack([(drawn == member).sum(1) for member in range(k)], 1).tolist()
-    memory: dict[tuple[torch.dtype, int], Tensor] = {}
-
-    def switching(inputs: Tensor, step: int) -> Tensor:
-        # Rows of the same member next to each other, for as long as the products take.
-        raw = ForwardPass(network, sizes[step], memory=memory)(inputs[order[step]])
-        result = torch.empty_like(inputs[:, : network.observation_dim])
-        result[order[step]] = network.sample(raw, draws.noise(step, order[step]))
-        return result
-
-    return switching
-
-
-def _rollout(
-    network: PlanningNetwork,
-    predict: _Predict,
-    x: Tensor,
-    u: Tensor,
-    reward: RewardFunction,
-    terminated: Termination | None,
-) -> Tensor:
-    """Returns ``(B,)`` of trajectories from ``(B, n)`` under actions ``(H, B, m)``."""
-    horizon, n = u.shape[0], x.shape[1]
-    # Column by column in memory: all that is done to a state is then done to whole columns.
-    inputs = x.new_empty(horizon + 1, n + u.shape[2], x.shape[0]).transpose(1, 2)
-    states = inputs[..., :n]
-    states[0] = x
-    inputs[:-1, :, n:] = u
-    for t in range(horizon):
-        change = predict(inputs[t], t)
-        torch.addcmul(states[t], change, network.change_std, out=states[t + 1])
-        states[t + 1] += network.change_mean
-    rewards = _along(reward(states[:-1], u, states[1:]), u, "reward")
-    if terminated is None:
-        # A state that is not finite stays so: the last tells for all.
-        sound = torch.isfinite(states[-1]).all(-1)
-    else:
-        ended = _along(terminated(states[1:]), u, "terminated").long()
-        over = (ended.cumsum(0) - ended) > 0
-        rewards = torch.where(over, 0.0, rewards)
-        sound = (torch.isfinite(states[1:]).all(-1) | over).all(0)
-    returns = rewards.sum(0)
-    return torch.where(sound & torch.isfinite(returns), returns, -torch.inf)
-
-
-def _along(values: Tensor, u: Tensor, name: str) -> Tensor:
-    if values.shape != u.shape[:2]:
-        raise ValueError(
-            f"the {name} function must return shape (...) for inputs of shape (..., width), got "
-            f"{tuple(values.shape)} for inputs of shape {tuple(u.shape[:2])} + (width,)"
-        )
-    return values

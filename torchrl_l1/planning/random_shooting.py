@@ -26,10 +26,13 @@ class ShootingConfig:
     Attributes:
         horizon: actions in a sequence, H.
         candidates: sequences drawn per environment, C.
+        warm_start: whether the mean given, for example the previous plan, shifted, is one of
+            them; published planners draw all of them (arXiv 1708.02596).
     """
 
     horizon: int = 25
     candidates: int = 2000
+    warm_start: bool = True
 
     def __post_init__(self) -> None:
         """Refuse settings that could only fail later.
@@ -49,10 +52,10 @@ def plan(
     config: ShootingConfig,
     generator: torch.Generator | None = None,
 ) -> Plan:
-    """The best of the given mean and of sequences uniform between the bounds.
+    """The best of sequences uniform between the bounds and, with a warm start, of the given mean.
 
-    Arguments and errors are those of :func:`torchrl_l1.planning.cem.plan`; the mean is the
-    first candidate.
+    Arguments and errors are those of :func:`torchrl_l1.planning.cem.plan`. With a warm start the
+    mean is the first candidate; without one it matters only where no return is finite.
 
     Examples:
         >>> result = plan(
@@ -71,7 +74,8 @@ def plan(
     shape = (mean.shape[0], config.candidates, *mean.shape[1:])
     uniform = torch.rand(shape, dtype=mean.dtype, device=mean.device, generator=generator)
     sequences = low + uniform * (high - low)
-    sequences[:, 0] = mean
+    if config.warm_start:
+        sequences[:, 0] = mean
     returns = evaluated(evaluate, sequences)
     worst = torch.full_like(mean[:, 0, 0], -torch.inf)
     best, best_return = keep_best(mean, worst, sequences, returns)

@@ -1,0 +1,124 @@
+"""Fine-tuning by PPO."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.distributions import Normal
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_l1.algorithms.fine_tuning import FineTuning, exploring
+from torchrl_l1.algorithms.mbmf_config import TuningConfig
+from torchrl_l1.algorithms.policy import GaussianPolicy
+from torchrl_l1.envs import get_task
+
+TASK = get_task("inverted_pendulum")
+
+
+def make(**changes: object) -> tuple[GaussianPolicy, FineTuning]:
+    torch.manual_seed(0)
+    policy = GaussianPolicy(TASK.observation_dim, TASK.action_dim, [16], std=0.5)
+    return policy, FineTuning(policy, TuningConfig(**changes))  # type: ignore[arg-type]
+
+
+def episodes(policy: GaussianPolicy, target: float, count: int = 200) -> TensorDict:
+    """Episodes of one step, with the reward highest at ``target``."""
+    data = TensorDict({"observation": torch.randn(count, 1, TASK.observation_dim)}, [count, 1])
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        exploring(policy, TASK)(data)
+    ended = torch.ones(count, 1, 1, dtype=torch.bool)
+    data["next"] = TensorDict(
+        {
+            "observation": torch.randn(count, 1, TASK.observation_dim),
+            "reward": -(data["sampled"] - target).square(),
+            "done": ended,
+            "terminated": ended,
+        },
+        [count, 1],
+    )
+    return data
+
+
+def test_explores_within_bounds_and_keeps_what_was_drawn() -> None:
+    policy, _ = make()
+    policy.reset_std(4.0)
+    data = episodes(policy, 0.0)
+    drawn = data["sampled"]
+    assert torch.equal(data["action"], drawn.clamp(-3, 3))
+    assert (drawn.abs() > 3).any()
+    mean, std = policy(data["observation"])
+    density = Normal(mean, std).log_prob(drawn).sum(-1)
+    torch.testing.assert_close(data["sampled_log_prob"], density)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        exploring(policy, TASK)(data)
+    torch.testing.assert_close(data["action"], mean.clamp(-3, 3))
+
+
+def test_finds_the_action_of_highest_reward() -> None:
+    policy, tuning = make(learning_rate=3e-3, minibatches=4)
+    for _ in range(15):
+        report = tuning.step(episodes(policy, 1.0))
+    mean, _ = policy(torch.randn(100, TASK.observation_dim))
+    assert mean.mean().item() == pytest.approx(1.0, abs=0.2)
+    assert report.kl < 0.2
+
+
+def test_values_approach_the_discounted_return() -> None:
+    """Reward one for ever, in pieces of 20 steps: the value is 1 / (1 - gamma)."""
+    policy, tuning = make(discount=0.8, value_learning_rate=1e-2)
+    steps, going = 20, torch.zeros(8, 20, 1, dtype=torch.bool)
+    for _ in range(12):
+        observation = torch.randn(8, steps + 1, TASK.observation_dim)
+        data = TensorDict({"observation": observation[:, :-1]}, [8, steps])
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+            exploring(policy, TASK)(data)
+        cut = going.clone()
+        cut[:, -1] = True  # the end of the data, not of the task
+        data["next"] = TensorDict(
+            {
+                "observation": observation[:, 1:],
+                "reward": torch.ones(8, steps, 1),
+                "done": cut,
+                "terminated": going,
+            },
+            [8, steps],
+        )
+        tuning.step(data)
+    value = tuning.value(torch.randn(200, TASK.observation_dim))
+    assert value.mean().item() == pytest.approx(5.0, rel=0.1)
+
+
+def test_annealing_ends_learning() -> None:
+    policy, tuning = make()
+    before = [parameter.clone() for parameter in policy.parameters()]
+    tuning.step(episodes(policy, 1.0), progress=1.0)
+    pairs = zip(before, policy.parameters(), strict=True)
+    assert all(torch.equal(kept, parameter) for kept, parameter in pairs)
+
+
+def test_each_network_learns_in_its_own_passes() -> None:
+    policy, tuning = make(epochs=1, value_epochs=5)
+    other, same = make(epochs=1, value_epochs=1)
+    data = episodes(policy, 1.0)
+    for agent in (tuning, same):
+        torch.manual_seed(1)
+        agent.step(data.clone())
+    assert torch.equal(policy.mean[0].weight, other.mean[0].weight)
+    assert not torch.equal(tuning.value.network[0].weight, same.value.network[0].weight)
+
+
+def test_resumed_rounds_repeat_the_unbroken_ones() -> None:
+    policy, tuning = make()
+    tuning.step(episodes(policy, 1.0))
+    copy, resumed = make()
+    copy.load_state_dict(policy.state_dict())
+    resumed.load_state_dict(deepcopy(tuning.state_dict()))
+    data = episodes(policy, 1.0)
+    for agent in (tuning, resumed):
+        torch.manual_seed(1)
+        agent.step(data.clone())
+    for name, value in policy.state_dict().items():
+        assert torch.equal(value, copy.state_dict()[name]), name

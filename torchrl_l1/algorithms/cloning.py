@@ -1,0 +1,129 @@
+"""Behaviour cloning: a policy network learns to act as a planner does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+
+from torchrl_l1.algorithms.mbmf_config import CloningConfig
+from torchrl_l1.algorithms.policy import GaussianPolicy
+
+
+@dataclass
+class CloningReport:
+    """Outcome of a fit.
+
+    Attributes:
+        train_loss: mean loss over the last epoch, while the weights changed.
+        validation_loss: loss of the weights that were kept.
+        epochs: passes over the training data.
+    """
+
+    train_loss: float
+    validation_loss: float
+    epochs: int
+
+
+class Cloning:
+    """States, the actions that an expert takes in them, and the fits of a policy to both.
+
+    The loss is the squared error of the policy's mean action, in halves of the action range,
+    averaged over the entries of the action: that of DAgger (arXiv 1011.0686) for continuous
+    actions, as arXiv 1708.02596 (section V) has it. The standard deviation is not fitted.
+
+    Args:
+        policy: changed in place.
+        config: how it is fitted.
+        half_range: half the range of the actions.
+        capacity: states that there is room for.
+    """
+
+    def __init__(
+        self, policy: GaussianPolicy, config: CloningConfig, half_range: float, capacity: int
+    ) -> None:
+        self.policy, self.config, self.half_range = policy, config, half_range
+        self.buffer = ReplayBuffer(
+            storage=LazyTensorStorage(capacity), batch_size=config.batch_size
+        )
+
+    def store(self, observation: Tensor, action: Tensor) -> None:
+        """Add states ``(B, n)`` with the expert's actions ``(B, m)``, where both are finite.
+
+        A fixed share of them is kept out of training for good.
+        """
+        finite = torch.isfinite(observation).all(-1) & torch.isfinite(action).all(-1)
+        items = TensorDict(
+            {"observation": observation[finite], "action": action[finite]},
+            batch_size=[int(finite.sum())],
+        )
+        items["validation"] = torch.rand(items.shape[0]) < self.config.validation_fraction
+        if items.shape[0]:
+            self.buffer.extend(items)
+
+    def fit(self, on_epoch: Callable[[int], None] | None = None) -> CloningReport:
+        """Fit the policy to all pairs so far, from the weights that it has.
+
+        The weights kept are those of the epoch with the lowest validation loss.
+
+        Raises:
+            ValueError: if there is nothing to train or to validate on.
+        """
+        config, policy = self.config, self.policy
+        train, validation = self._split(next(policy.parameters()).device)
+        policy.normalizer.fit(train["observation"])
+        optimizer = torch.optim.Adam(policy.mean.parameters(), lr=config.learning_rate, fused=True)
+        best, best_loss, stale = deepcopy(policy.mean.state_dict()), torch.inf, 0
+        epoch, running = 0, 0.0
+        for epoch in range(1, config.max_epochs + 1):
+            order = torch.randperm(train.shape[0], device=train.device)
+            batches = order.split(config.batch_size)
+            running = 0.0
+            for index in batches:
+                loss = self._loss(train[index])
+                optimizer.zero_grad(set_to_none=True)
+                loss.backward()
+                optimizer.step()
+                running += loss.item() / len(batches)
+            with torch.no_grad():
+                current = self._loss(validation).item()
+            stale += 1
+            if current < best_loss:
+                best, best_loss, stale = deepcopy(policy.mean.state_dict()), current, 0
+            if on_epoch is not None:
+                on_epoch(epoch)
+            if stale >= config.patience:
+                break
+        policy.mean.load_state_dict(best)
+        return CloningReport(running, best_loss, epoch)
+
+    def _loss(self, data: TensorDictBase) -> Tensor:
+        mean, _ = self.policy(data["observation"])
+        return ((mean - data["action"]) / self.half_range).square().mean()
+
+    def _split(self, device: torch.device) -> tuple[TensorDict, TensorDict]:
+        data = self.buffer[:].to(device) if len(self.buffer) else TensorDict(batch_size=[0])
+        held_out = data["validation"].reshape(-1) if len(self.buffer) else torch.zeros(0).bool()
+        train, validation = data[~held_out], data[held_out]
+        if train.shape[0] == 0 or validation.shape[0] == 0:
+            raise ValueError(
+                f"cannot clone: {train.shape[0]} training and {validation.shape[0]} validation "
+                "states; collect more of them or change cloning.validation_fraction"
+            )
+        return train, validation
+
+    def state_dict(self) -> dict[str, Any]:
+        """The pairs so far, as plain tensors."""
+        return {"pairs": self.buffer[:].to_dict() if len(self.buffer) else {}}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from :meth:`state_dict`; other entries of ``state`` do not matter."""
+        self.buffer.empty()
+        if state["pairs"]:
+            self.buffer.extend(TensorDict(state["pairs"]).auto_batch_size_(1))

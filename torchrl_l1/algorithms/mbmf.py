@@ -1,0 +1,319 @@
+"""MBMF: random shooting in a learned model, distilled into a policy that PPO then improves.
+
+Three stages (arXiv 1708.02596): the model is fitted to real data that a random-shooting planner
+collects with it; a policy network clones the planner, by DAgger; model-free reinforcement learning
+improves the policy on real data. With L1 on, the adaptive controller augments the planner's actions
+in the first stage (arXiv 2403.14860, section "L1-MBMF"); the other two do not know of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from copy import deepcopy
+from functools import partial
+from time import perf_counter
+from typing import Any, ClassVar
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from torchrl_l1.algorithms.algorithm import IterationResult
+from torchrl_l1.algorithms.cloning import Cloning
+from torchrl_l1.algorithms.collection import (
+    Collection,
+    Perturbation,
+    episode_returns,
+    return_metrics,
+    signal_metrics,
+)
+from torchrl_l1.algorithms.device import resolve_device
+from torchrl_l1.algorithms.fine_tuning import FineTuning, exploring
+from torchrl_l1.algorithms.mbmf_config import MBMFConfig
+from torchrl_l1.algorithms.mbmf_metrics import STAGES, cloning_metrics, tuning_metrics
+from torchrl_l1.algorithms.metrics import fit_metrics
+from torchrl_l1.algorithms.model_learning import ModelLearning
+from torchrl_l1.algorithms.policy import GaussianPolicy, acting
+from torchrl_l1.algorithms.seeding import seed_streams
+from torchrl_l1.control import L1Config
+from torchrl_l1.control.compilation import CompileMode
+from torchrl_l1.dynamics import make_dynamics
+from torchrl_l1.envs import get_task
+from torchrl_l1.planning import ModelPredictiveController, TrajectorySampler, resolve_precision
+
+_PHASES = ("random", "fit", "clone", "tune", "collect", "evaluate")
+
+
+class MBMF:
+    """The algorithm and its state; :meth:`iterate` is the loop.
+
+    Args:
+        task: name of a task, see :data:`torchrl_l1.envs.TASKS`.
+        config: settings.
+        l1: the adaptive controller around the planner; ``None`` for none.
+        perturbation: noise and disturbances of the real environment, in all stages.
+        seed: seed of every random stream. Streams are derived anew from the seed and the
+            iteration's number, so that a resumed run draws what an unbroken one would have.
+        horizon: steps per real episode; the task's own by default.
+        device: where models are fitted and plans are made: ``cpu``, ``cuda`` or ``auto``. Real
+            environments, the copy of the model that L1 uses in them, and the policy, which is
+            small, are on the CPU.
+        compile_l1: whether to compile the controller's step, see
+            :class:`~torchrl_l1.control.L1Transform`.
+        on_phase: called with a word on what is going on, for progress bars.
+    """
+
+    stochastic: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        task: str,
+        config: MBMFConfig,
+        l1: L1Config | None = None,
+        perturbation: Perturbation | None = None,
+        seed: int = 0,
+        horizon: int | None = None,
+        device: str = "cpu",
+        compile_l1: CompileMode = False,
+        on_phase: Callable[[str], None] | None = None,
+    ) -> None:
+        self.config, self.seed = config, seed
+        self.device = resolve_device(device)
+        self.on_phase = on_phase or (lambda phase: None)
+        self.task = get_task(task)
+        n, m = self.task.observation_dim, self.task.action_dim
+        seed_streams(seed, "initialisation")
+        self.dynamics = make_dynamics(n, m, **vars(config.model)).to(self.device)
+        on_cpu = self.device.type == "cpu"
+        self.acting_dynamics = self.dynamics if on_cpu else deepcopy(self.dynamics).cpu()
+        self.planner = self._planner()
+        self.initial = GaussianPolicy(n, m, config.hidden, config.cloning.std)
+        self.clone, self.policy = deepcopy(self.initial), deepcopy(self.initial)
+        self.tuning = FineTuning(self.policy, config.tuning)
+
+        real = partial(
+            Collection,
+            self.task,
+            dynamics=self.acting_dynamics,
+            perturbation=perturbation or Perturbation(),
+        )
+        full = horizon or self.task.horizon
+        steps = min(config.episode_steps or full, full)
+        short = partial(real, horizon=steps)
+        measured = partial(real, episodes=config.evaluation_episodes, horizon=full, l1=None)
+        planned = partial(real, policy=self.planner, l1=l1, compile_l1=compile_l1)
+        self.start = planned(
+            episodes=config.random_episodes, horizon=min(config.random_steps or steps, full)
+        )
+        self.shooting = planned(episodes=config.shooting_episodes, horizon=steps)
+        self.shooting_evaluation = planned(episodes=config.shooting_episodes, horizon=full)
+        visiting = self.clone if config.cloning.states == "current" else self.initial
+        self.visits = short(
+            policy=acting(visiting, self.task), episodes=config.cloning.episodes, l1=None
+        )
+        self.clone_evaluation = measured(policy=acting(self.clone, self.task))
+        explorer = exploring(self.policy, self.task)
+        self.practice = short(policy=explorer, episodes=config.tuning.episodes, l1=None)
+        self.policy_evaluation = measured(policy=explorer)
+
+        shot = config.shooting_iterations * self.shooting.frames
+        visited = (config.cloning.iterations - 1) * self.visits.frames
+        self.learning = ModelLearning(
+            self.dynamics, config.fit, config.label, self.start.frames + shot + visited
+        )
+        half = (self.task.action_high - self.task.action_low) / 2
+        self.cloning = Cloning(self.clone, config.cloning, half, shot + visited)
+        self.iteration = 0
+
+    def iterate(self) -> Iterator[IterationResult]:
+        """Run the outer iterations that are left, of all stages, reporting after each."""
+        rounds = {"shooting": self._shoot, "cloning": self._clone, "tuning": self._tune}
+        while self.iteration < self.config.outer_iterations:
+            seed_streams(self.seed, "iteration", self.iteration)
+            self._seconds = dict.fromkeys(_PHASES, 0.0)
+            name, number = self.stage(self.iteration)
+            metrics = rounds[name](number)
+            head = {
+                "iteration": self.iteration,
+                "real_steps": self.real_steps(self.iteration + 1),
+                "stage": STAGES.index(name) + 1,
+            }
+            self.iteration += 1
+            yield IterationResult({**head, **metrics}, self._seconds)
+
+    def stage(self, iteration: int) -> tuple[str, int]:
+        """Stage of an outer iteration, and its number within it."""
+        shooting, cloning = self.config.shooting_iterations, self.config.cloning.iterations
+        if iteration < shooting:
+            return "shooting", iteration
+        if iteration < shooting + cloning:
+            return "cloning", iteration - shooting
+        return "tuning", iteration - shooting - cloning
+
+    def real_steps(self, iterations: int) -> int:
+        """Real steps, random ones included, of so many outer iterations."""
+        shooting, cloning = self.config.shooting_iterations, self.config.cloning.iterations
+        shot = min(iterations, shooting)
+        visited = min(max(iterations - shooting - 1, 0), cloning - 1)
+        tuned = max(iterations - shooting - cloning, 0)
+        return (
+            self.start.frames
+            + shot * self.shooting.frames
+            + visited * self.visits.frames
+            + tuned * self.practice.frames
+        )
+
+    def _shoot(self, number: int) -> dict[str, float]:
+        """Stage 1: fit the model, let the planner act, with L1 around it if it is on."""
+        if number == 0:
+            with self._phase("random", "random data"):
+                self.learning.store(self.start.random(self.seed, self._bounds()))
+        fit = self._fit()
+        with self._phase("collect", "planning and collecting"):
+            data = self.shooting.collect(self.seed, self.iteration)
+            self.learning.store(data)
+            self.cloning.store(data["observation"].flatten(0, 1), data["action"].flatten(0, 1))
+        full = data
+        if self.shooting.horizon < self.shooting_evaluation.horizon:
+            with self._phase("evaluate", "evaluating"):
+                full = self.shooting_evaluation.evaluate(self.seed, self.iteration)
+        return {
+            **_returns(full, full),
+            **signal_metrics(data),
+            **fit,
+            "plan/promised_return": data["next", "plan", "best_return"].mean().item(),
+        }
+
+    def _clone(self, number: int) -> dict[str, float]:
+        """Stage 2: the policy visits states, the planner labels them, the policy is fitted."""
+        fit = self._fit()
+        labels = {}
+        if number > 0:
+            with self._phase("collect", "visiting states and labelling them"):
+                data = self.visits.collect(self.seed, self.iteration)
+                self.learning.store(data)
+                states = data["observation"].flatten(0, 1)
+                plans = self.planner.plan(states)
+                self.cloning.store(states, plans.actions[:, 0].cpu())
+                labels["plan/promised_return"] = plans.best_return.mean().item()
+        with self._phase("clone", "cloning"):
+            report = self.cloning.fit(lambda epoch: self.on_phase(f"cloning, epoch {epoch}"))
+        with self._phase("evaluate", "evaluating"):
+            data = self.clone_evaluation.evaluate(self.seed, self.iteration)
+        return {
+            **_returns(data, data),
+            **signal_metrics(data),
+            **fit,
+            **labels,
+            **cloning_metrics(report, len(self.cloning.buffer)),
+        }
+
+    def _tune(self, number: int) -> dict[str, float]:
+        """Stage 3: the policy acts without a model, and PPO learns from that."""
+        config = self.config.tuning
+        if number == 0:
+            self.policy.load_state_dict(self.clone.state_dict())
+            self.policy.reset_std(config.std)
+        with self._phase("collect", "collecting"):
+            data = self.practice.collect(self.seed, self.iteration)
+        done = number * self.practice.frames / (config.anneal_steps or math.inf)
+        with self._phase("tune", "PPO"):
+            report = self.tuning.step(data, min(done, 1.0))
+        with self._phase("evaluate", "evaluating"):
+            evaluate = partial(self.policy_evaluation.evaluate, self.seed, self.iteration)
+            shorter = self.practice.horizon < self.policy_evaluation.horizon
+            whole = not shorter and not data["next", "terminated"].any()
+            sampled = data if whole else evaluate(deterministic=False)
+            returns = _returns(sampled, evaluate(deterministic=True))
+        return {
+            **returns,
+            **signal_metrics(data),
+            **tuning_metrics(report),
+            "policy/std": self.policy.log_std.detach().exp().mean().item(),
+        }
+
+    def _fit(self) -> dict[str, float]:
+        with self._phase("fit", "fit"):
+            report = self.learning.fit(lambda epoch: self.on_phase(f"fit, epoch {epoch}"))
+            self.acting_dynamics.load_state_dict(self.dynamics.state_dict())
+        return fit_metrics(report)
+
+    @contextmanager
+    def _phase(self, name: str, words: str) -> Iterator[None]:
+        self.on_phase(words)
+        start = perf_counter()
+        yield
+        self._seconds[name] += perf_counter() - start
+
+    def _planner(self) -> ModelPredictiveController:
+        config, task = self.config, self.task
+        sampler = TrajectorySampler(
+            self.dynamics,
+            task.imagined_reward,
+            task.terminated if task.terminates else None,
+            config.particles,
+            config.propagation,  # type: ignore[arg-type]
+            config.precision,  # type: ignore[arg-type]
+            discount=config.plan_discount,
+        )
+        return ModelPredictiveController(
+            sampler, config.shooting, *self._bounds(), replan_every=config.replan_every
+        )
+
+    def _bounds(self) -> tuple[float, float]:
+        """Bounds of random and planned actions."""
+        own = math.inf if self.config.action_bound is None else self.config.action_bound
+        return max(self.task.action_low, -own), min(self.task.action_high, own)
+
+    @property
+    def policies(self) -> Mapping[str, TensorDictModuleBase]:
+        """What acts in real environments after each stage, those that have begun."""
+        rounds = max(self.iteration - 1, 0)
+        reached = STAGES.index(self.stage(rounds)[0]) + 1
+        every = (self.shooting, self.clone_evaluation, self.policy_evaluation)
+        return {
+            name: collection.policy
+            for name, collection in zip(STAGES[:reached], every[:reached], strict=True)
+        }
+
+    def choices(self) -> dict[str, str]:
+        """Where plans are made, and in which precision."""
+        hidden = self.dynamics.network.weights[:-1]
+        width = min((weight.shape[2] for weight in hidden), default=0)
+        precision = resolve_precision(self.config.precision, self.device, width)
+        return {"device": str(self.device), "precision": precision}
+
+    def weights(self) -> dict[str, dict[str, Any]]:
+        """State dicts of the model, the cloned policy and the one that PPO improves."""
+        return {
+            "model": self.dynamics.state_dict(),
+            "clone": self.clone.state_dict(),
+            "policy": self.policy.state_dict(),
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to continue, as plain tensors and numbers."""
+        return {
+            "iteration": self.iteration,
+            "clone": self.clone.state_dict(),
+            "policy": self.policy.state_dict(),
+            "cloning": self.cloning.state_dict(),
+            "tuning": self.tuning.state_dict(),
+            **self.learning.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        self.iteration = state["iteration"]
+        self.clone.load_state_dict(state["clone"])
+        self.policy.load_state_dict(state["policy"])
+        self.cloning.load_state_dict(state["cloning"])
+        self.tuning.load_state_dict(state["tuning"])
+        self.learning.load_state_dict(state)
+        self.acting_dynamics.load_state_dict(self.dynamics.state_dict())
+
+
+def _returns(sampled: TensorDictBase, mean_action: TensorDictBase) -> dict[str, float]:
+    deterministic = episode_returns(mean_action).mean().item()
+    return {**return_metrics(sampled), "return_deterministic": deterministic}

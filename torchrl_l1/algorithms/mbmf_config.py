@@ -1,0 +1,216 @@
+"""Settings of MBMF."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from torchrl_l1.algorithms.checks import check_choice, check_positive, check_widths
+from torchrl_l1.algorithms.model_config import ModelConfig
+from torchrl_l1.dynamics import FitConfig
+from torchrl_l1.planning import ShootingConfig, check_sampling
+
+
+@dataclass
+class CloningConfig:
+    """The second stage: a policy network learns what the planner does (DAgger).
+
+    Attributes:
+        iterations: rounds. The first clones the planner's own data; before each of the others the
+            policy visits states, and the planner says what it would do there.
+        episodes: real episodes per round but the first, side by side.
+        std: standard deviation of the policy's actions there, action units.
+        states: whose states the planner labels: those of the ``current`` policy, or of the
+            ``initial`` one with its random weights, as in the published code, where the workers
+            that collect never receive what has been learned.
+        learning_rate: Adam's step size.
+        batch_size: states per gradient step.
+        max_epochs: passes over the training data in a round.
+        patience: epochs without a lower validation loss before a round stops.
+        validation_fraction: share of the states kept out of training for good.
+    """
+
+    iterations: int = 4
+    episodes: int = 1
+    std: float = 0.005
+    states: str = "current"
+    learning_rate: float = 1e-3
+    batch_size: int = 500
+    max_epochs: int = 100
+    patience: int = 20
+    validation_fraction: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Refuse settings that could only fail later.
+
+        Raises:
+            ValueError: naming the setting.
+        """
+        check_counts("cloning", self, "iterations", "episodes", "batch_size", "max_epochs")
+        check_counts("cloning", self, "patience")
+        check_positive("cloning.std", self.std)
+        check_positive("cloning.learning_rate", self.learning_rate)
+        check_choice("cloning.states", self.states, ("current", "initial"))
+        if not 0 < self.validation_fraction < 1:
+            raise ValueError(
+                "cloning.validation_fraction must be between 0 and 1, got "
+                f"{self.validation_fraction}"
+            )
+
+
+@dataclass
+class TuningConfig:
+    """The third stage: the cloned policy is improved by PPO on real data (arXiv 1707.06347).
+
+    Attributes:
+        episodes: real episodes per round, side by side. Where episodes end early, others follow
+            until each environment has taken as many steps as a full episode has.
+        std: standard deviation of the actions at the start, action units.
+        value_hidden: widths of the value network's hidden layers.
+        learning_rate: Adam's step size for the policy.
+        value_learning_rate: and for the value network.
+        anneal_steps: real steps of this stage over which both fall to zero linearly; they stay if
+            null.
+        epochs: passes of the policy over a round's data.
+        value_epochs: and of the value network.
+        minibatches: gradient steps per pass.
+        clip: bound on the change of the likelihood ratio in the objective.
+        entropy: coefficient of the entropy bonus.
+        discount: gamma.
+        gae_lambda: lambda of the generalized advantage estimate.
+        max_gradient_norm: gradients are scaled down to this norm.
+    """
+
+    episodes: int = 4
+    std: float = 0.5
+    value_hidden: list[int] = field(default_factory=lambda: [64, 64])
+    learning_rate: float = 3e-4
+    value_learning_rate: float = 1e-3
+    anneal_steps: int | None = None
+    epochs: int = 10
+    value_epochs: int = 10
+    minibatches: int = 16
+    clip: float = 0.2
+    entropy: float = 0.0
+    discount: float = 0.99
+    gae_lambda: float = 0.95
+    max_gradient_norm: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse settings that could only fail later.
+
+        Raises:
+            ValueError: naming the setting.
+        """
+        check_counts("tuning", self, "episodes", "epochs", "value_epochs", "minibatches")
+        check_widths("tuning.value_hidden", self.value_hidden)
+        positive = ("std", "learning_rate", "value_learning_rate", "clip", "max_gradient_norm")
+        for name in positive:
+            check_positive(f"tuning.{name}", getattr(self, name))
+        if self.anneal_steps is not None:
+            check_counts("tuning", self, "anneal_steps")
+        if not 0 <= self.entropy < math.inf:
+            raise ValueError(f"tuning.entropy must be finite and not negative, got {self.entropy}")
+        for name in ("discount", "gae_lambda"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"tuning.{name} must be in [0, 1], got {getattr(self, name)}")
+
+
+@dataclass
+class MBMFConfig:
+    """Settings of :class:`~torchrl_l1.algorithms.MBMF`.
+
+    Attributes:
+        outer_iterations: rounds of all stages together: ``shooting_iterations``, then
+            ``cloning.iterations``, and fine-tuning in those that are left.
+        shooting_iterations: rounds of model fit and random shooting.
+        random_episodes: real episodes of random actions before the first round.
+        random_steps: steps of each; those of a shooting episode if null. On a task that random
+            actions fail at once, many short episodes show more of what matters than a long one.
+        shooting_episodes: real episodes per round of shooting, side by side.
+        episode_steps: steps of a collected episode, in all stages; the task's horizon if null.
+            Returns are then measured on full episodes that do not join the data.
+        evaluation_episodes: full episodes with the mean action after each round of cloning and
+            fine-tuning (and with sampled actions if those collected are shorter than the task's,
+            or ended early).
+        replan_every: actions taken from a plan before the next.
+        plan_discount: discount of imagined rewards per step.
+        action_bound: random and planned actions are drawn from this far around zero, within the
+            task's own bounds; the whole of these if null. The published code draws from [-1, 1],
+            whatever the bounds.
+        particles: imagined trajectories per candidate sequence.
+        propagation: how they travel through the ensemble: ``tsinf``, ``ts1`` or ``mean``, see
+            :func:`~torchrl_l1.planning.evaluate`.
+        precision: of the hidden layers in planning: ``float32``, ``bfloat16``, or ``auto`` for
+            what the processor multiplies fastest.
+        label: action that the model is fitted to: ``nominal`` is the planner's, ``executed`` what
+            L1 sends to the actuators.
+        hidden: widths of the policy network's hidden layers.
+        shooting: see :class:`~torchrl_l1.planning.ShootingConfig`.
+        model: see :class:`ModelConfig`.
+        fit: see :class:`~torchrl_l1.dynamics.FitConfig`.
+        cloning: see :class:`CloningConfig`.
+        tuning: see :class:`TuningConfig`.
+    """
+
+    outer_iterations: int = 58
+    shooting_iterations: int = 7
+    random_episodes: int = 1
+    random_steps: int | None = None
+    shooting_episodes: int = 1
+    episode_steps: int | None = None
+    evaluation_episodes: int = 4
+    replan_every: int = 1
+    plan_discount: float = 1.0
+    action_bound: float | None = None
+    particles: int = 1
+    propagation: str = "mean"
+    precision: str = "auto"
+    label: str = "executed"
+    hidden: list[int] = field(default_factory=lambda: [64, 64])
+    shooting: ShootingConfig = field(
+        default_factory=lambda: ShootingConfig(horizon=20, candidates=1000)
+    )
+    model: ModelConfig = field(default_factory=lambda: ModelConfig(members=1))
+    fit: FitConfig = field(default_factory=FitConfig)
+    cloning: CloningConfig = field(default_factory=CloningConfig)
+    tuning: TuningConfig = field(default_factory=TuningConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse settings that could only fail later.
+
+        Raises:
+            ValueError: naming the setting.
+        """
+        check_choice("label", self.label, ("nominal", "executed"))
+        check_widths("hidden", self.hidden)
+        for name in (
+            "outer_iterations",
+            "shooting_iterations",
+            "random_episodes",
+            "shooting_episodes",
+            "evaluation_episodes",
+        ):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("episode_steps", "random_steps"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1 or null, got {value}")
+        if not 0 < self.plan_discount <= 1:
+            raise ValueError(f"plan_discount must be in (0, 1], got {self.plan_discount}")
+        if self.action_bound is not None:
+            check_positive("action_bound", self.action_bound)
+        if not 1 <= self.replan_every <= self.shooting.horizon:
+            raise ValueError(
+                f"replan_every must be between 1 and shooting.horizon ({self.shooting.horizon}), "
+                f"got {self.replan_every}"
+            )
+        check_sampling(self.particles, self.propagation, self.precision)
+
+
+def check_counts(prefix: str, settings: object, *names: str) -> None:
+    """Refuse counts below one, with a ``ValueError``."""
+    for name in names:
+        if getattr(settings, name) < 1:
+            raise ValueError(f"{prefix}.{name} must be at least 1, got {getattr(settings, name)}")

@@ -1,0 +1,144 @@
+"""The motion of particles compiled into one graph: a batched product of all members per layer."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from functools import cache
+from importlib.util import find_spec
+from itertools import groupby
+from types import FunctionType
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from torchrl_l1.control.compilation import CompileMode, compiled
+from torchrl_l1.planning.network import PlanningNetwork, affine_output
+from torchrl_l1.planning.particle_draws import Draws
+from torchrl_l1.planning.particle_motion import Predict, Propagation
+
+_Group = tuple[int, int, int]
+
+
+def resolve_compilation(
+    mode: bool | str, device: torch.device | str = "cpu", propagation: str = "tsinf"
+) -> bool:
+    """``"auto"`` becomes ``True`` on a GPU with a compiler, where many small calls cost most.
+
+    On the CPU it becomes ``False``. The eager path takes a block of particles through a member's
+    layers while they are in the cache; compiled, all members go through a layer together. In
+    float32 that is slower, in bfloat16 the one is about as fast as the other, and compiling takes
+    some ten seconds of every run.
+
+    Args:
+        mode: ``"auto"``, or what is to be returned.
+        device: where plans are made.
+        propagation: how particles travel. ``"ts1"`` is eager: how many rows a member has changes
+            from step to step.
+
+    Raises:
+        ValueError: for another mode, or ``True`` with ``"ts1"``.
+    """
+    if mode is False:
+        return False
+    serves = propagation != "ts1"
+    if mode is True:
+        if not serves:
+            raise ValueError(
+                "propagation 'ts1' cannot be compiled, since members change rows at every step; "
+                "set compile to False or 'auto', or propagation to 'tsinf' or 'mean'"
+            )
+        return True
+    if mode != "auto":
+        raise ValueError(f"compile must be True, False or 'auto', got {mode!r}")
+    return serves and torch.device(device).type == "cuda" and _has_compiler()
+
+
+def compiled_predictor(
+    network: PlanningNetwork,
+    propagation: Propagation,
+    shares: list[int],
+    draws: Draws,
+    mode: CompileMode,
+) -> Predict:
+    """What :func:`torchrl_l1.planning.particle_motion.predictor` gives, compiled.
+
+    Ensembles of the same sizes share a graph, whatever their weights and the number of rows.
+
+    Args:
+        network: the members.
+        propagation: ``"tsinf"`` or ``"mean"``.
+        shares: particles of each member.
+        draws: the noise.
+        mode: ``"auto"`` runs the same operations one by one where the compiler fails, ``True``
+            raises.
+    """
+    together = propagation == "mean"
+    groups = ((0, network.members, 1),) if together else _groups(shares)
+    parts = (*network.weights, network.bias)
+    sizes = tuple((part.shape, part.dtype, part.device) for part in parts)
+    point = network.standard_deviation is None
+    change = _compiled((network.activation, point, groups, together, *sizes), mode)
+
+    def predict(inputs: Tensor, step: int) -> Tensor:
+        noise = None if together else draws.noise(step)
+        for rows in (inputs, noise):
+            if rows is not None:
+                torch._dynamo.maybe_mark_dynamic(rows, 0)
+        return change(network, groups, together, inputs, noise)
+
+    return predict
+
+
+# One for each kind of ensemble: torch keeps eight graphs of a function, and then gives up.
+@cache
+def _compiled(kind: tuple[Any, ...], mode: CompileMode) -> Callable[..., Tensor]:
+    return compiled(cast(FunctionType, _change), mode)
+
+
+def _groups(shares: list[int]) -> tuple[_Group, ...]:
+    """First member, the one after the last, and particles of each, for runs of equal shares."""
+    groups, first = [], 0
+    for share, members in groupby(shares):
+        last = first + len(list(members))
+        groups.append((first, last, share))
+        first = last
+    return tuple(group for group in groups if group[2] > 0)
+
+
+def _change(
+    network: PlanningNetwork,
+    groups: tuple[_Group, ...],
+    together: bool,
+    inputs: Tensor,
+    noise: Tensor | None,
+) -> Tensor:
+    """Normalised change ``(B, n)`` from raw inputs ``(B, n + m)`` sorted by member."""
+    if together:
+        every = inputs.expand(network.members, -1, -1)
+        return _raw(network, 0, network.members, every)[..., : network.observation_dim].mean(0)
+    candidates = inputs.shape[0] // sum((last - first) * share for first, last, share in groups)
+    rows = inputs.split([(last - first) * share * candidates for first, last, share in groups])
+    raw = [
+        _raw(network, first, last, part.unflatten(0, (last - first, -1))).flatten(0, 1)
+        for (first, last, _), part in zip(groups, rows, strict=True)
+    ]
+    return network.sample(torch.cat(raw), noise)
+
+
+def _raw(network: PlanningNetwork, first: int, last: int, inputs: Tensor) -> Tensor:
+    """Raw outputs ``(k, R, out)`` of members from raw inputs ``(k, R, n + m)`` of each."""
+    weight, *following = network.weights
+    width = weight.shape[1]
+    units = torch.baddbmm(network.bias[first:last, None], inputs[..., :width], weight[first:last])
+    for weight in following:
+        units = torch.bmm(network.activation(units).to(weight.dtype), weight[first:last])
+    return affine_output(units.float(), inputs[..., width:])
+
+
+def _has_compiler() -> bool:
+    # Triton writes the kernels, and a C compiler what starts them.
+    compilers = (os.environ.get("CC"), "cc", "gcc", "clang")
+    return find_spec("triton") is not None and any(map(shutil.which, filter(None, compilers)))
