@@ -61,7 +61,9 @@ def resolve_public_name(app: Any, env: Any, node: Any, contnode: Any) -> Any:
 def write(folder: Path) -> None:
     """Write all generated pages; files that would not change are left alone."""
     pages = {f"api_{name}": api_page(name) for name in PACKAGES}
-    pages |= {"metrics": metrics_table("metrpo_metrics"), "metrics_pets": metrics_table("pets")}
+    pages["metrics"] = metrics_table("metrpo_metrics")
+    pages["metrics_mbmf"] = metrics_table("mbmf_metrics")
+    pages["metrics_pets"] = metrics_table("pets")
     folder.mkdir(exist_ok=True)
     for name, text in pages.items():
         path = folder / f"{name}.md"

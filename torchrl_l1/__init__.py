@@ -6,7 +6,7 @@ and ``report``.
 """
 
 from torchrl_l1._version import __version__
-from torchrl_l1.algorithms import METRPO, PETS, METRPOConfig, PETSConfig
+from torchrl_l1.algorithms import MBMF, METRPO, PETS, MBMFConfig, METRPOConfig, PETSConfig
 from torchrl_l1.control import (
     ActionJacobian,
     Affinizer,
@@ -17,9 +17,15 @@ from torchrl_l1.control import (
 )
 from torchrl_l1.dynamics import EnsembleDynamics, EnsembleDynamicsLoss, EnsembleModelEnv
 from torchrl_l1.envs import BatchedMujocoEnv, make_env
-from torchrl_l1.planning import CEMConfig, ModelPredictiveController, TrajectorySampler
+from torchrl_l1.planning import (
+    CEMConfig,
+    ModelPredictiveController,
+    ShootingConfig,
+    TrajectorySampler,
+)
 
 __all__ = [
+    "MBMF",
     "METRPO",
     "PETS",
     "ActionJacobian",
@@ -33,9 +39,11 @@ __all__ = [
     "L1Controller",
     "L1State",
     "L1Transform",
+    "MBMFConfig",
     "METRPOConfig",
     "ModelPredictiveController",
     "PETSConfig",
+    "ShootingConfig",
     "TrajectorySampler",
     "__version__",
     "make_env",
