@@ -15,6 +15,7 @@ from benchmarks import (
     jacobian,
     planning,
     planning_precision,
+    shooting,
 )
 from benchmarks.tables import Table
 
@@ -28,6 +29,7 @@ BENCHMARKS: dict[str, tuple[int, int, Callable[[int], Table]]] = {
     "collection": (collection.THREADS, 7, collection.table),
     "planning": (planning.THREADS, 9, planning.table),
     "planning_precision": (planning_precision.THREADS, 4, planning_precision.table),
+    "shooting": (shooting.THREADS, 9, shooting.table),
     "fitting": (fitting.THREADS, 9, fitting.table),
 }
 

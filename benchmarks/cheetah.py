@@ -50,9 +50,20 @@ def new_model() -> EnsembleDynamics:
     )
 
 
-def fitted_model(buffer: ReplayBuffer, gradient_steps: int) -> EnsembleDynamics:
-    """The model after some gradient steps."""
-    model = new_model()
+def new_point_model(members: int, hidden: tuple[int, ...]) -> EnsembleDynamics:
+    """A deterministic model of ReLU units before it has seen anything."""
+    task = get_task("half_cheetah")
+    torch.manual_seed(1)
+    return EnsembleDynamics(
+        task.observation_dim, task.action_dim, members=members, hidden=hidden, activation="relu"
+    )
+
+
+def fitted_model(
+    buffer: ReplayBuffer, gradient_steps: int, model: EnsembleDynamics | None = None
+) -> EnsembleDynamics:
+    """A model, by default the new one, after some gradient steps."""
+    model = model or new_model()
     config = FitConfig(batch_size=256, max_epochs=10**6, max_gradient_steps=gradient_steps)
     optimizer = torch.optim.Adam(model.parameters(), lr=config.learning_rate, fused=True)
     fit_ensemble(model, buffer, config, optimizer)

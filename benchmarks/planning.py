@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from collections.abc import Callable
 from functools import partial
@@ -39,6 +40,9 @@ PLANS: dict[str, tuple[Propagation, int, int, str]] = {
     "one member": ("tsinf", 1, 1, "TorchRL"),
 }
 
+COMPILED = f"{PARTICLES} particles, TSinf"
+"""The plan that is made by compiled code as well."""
+
 
 def make_plan(
     model: EnsembleDynamics,
@@ -48,6 +52,7 @@ def make_plan(
     particles: int = PARTICLES,
     generator: torch.Generator | None = None,
     common_noise: bool = True,
+    compile: bool = False,
 ) -> Tensor:
     """One plan of ours ``(1, H, m)`` from an observation ``(1, n)``, copy of weights included."""
     sampler = TrajectorySampler(
@@ -57,6 +62,7 @@ def make_plan(
         propagation=propagation,
         precision=precision,
         common_noise=common_noise,
+        compile=compile,
     )
     mean = torch.zeros(1, CONFIG.horizon, model.action_dim)
     evaluate = sampler.evaluator(observation, generator)
@@ -64,7 +70,7 @@ def make_plan(
 
 
 def torchrl_plan(
-    model: EnsembleDynamics, observation: Tensor, propagation: str
+    model: EnsembleDynamics, observation: Tensor, propagation: str, config: CEMConfig
 ) -> Callable[[], Tensor]:
     """TorchRL's planner on the same model as an environment."""
     env = EnsembleModelEnv(
@@ -75,7 +81,7 @@ def torchrl_plan(
         action_high=1.0,
         propagation=propagation,
     )
-    planner = CEMPlanner(env, CONFIG.horizon, CONFIG.iterations, CONFIG.candidates, CONFIG.elites)
+    planner = CEMPlanner(env, config.horizon, config.iterations, config.candidates, config.elites)
     start = env.reset(TensorDict({}, batch_size=[]))
 
     @torch.no_grad()
@@ -83,6 +89,16 @@ def torchrl_plan(
         return planner.planning(start)
 
     return plan
+
+
+def compiles(plan: Callable[..., Tensor]) -> bool:
+    """Whether a plan can be compiled; otherwise why not is printed."""
+    try:
+        plan(compile=True)
+    except RuntimeError as error:
+        print(f"without compiled plans: {error}", file=sys.stderr)
+        return False
+    return True
 
 
 def start_mbrl(worker: Peer, model: EnsembleDynamics) -> None:
@@ -150,32 +166,55 @@ def run(repetitions: int) -> list[Row]:
         steps = CONFIG.candidates * CONFIG.horizon * CONFIG.iterations
         flops[name] = steps * predictions * cheetah.flops_per_prediction(model)
         for precision in PRECISIONS:
-            cases[name, precision] = partial(
-                make_plan, model, observation, precision, propagation, particles
-            )
+            plan = partial(make_plan, model, observation, precision, propagation, particles)
+            cases[name, precision] = plan
+            if name == COMPILED and compiles(plan):
+                cases[name, f"{precision}, compiled"] = partial(plan, compile=True)
         if rival == "TorchRL":
             kind = "mean" if propagation == "mean" else "random_member"
-            cases[name, rival] = torchrl_plan(model, observation, kind)
+            cases[name, rival] = torchrl_plan(model, observation, kind, CONFIG)
         elif worker is not None:
             cases[name, rival] = partial(worker.call, "plan", observation=observation[0].tolist())
-    product = f"product of two matrices, {MATRIX} x {MATRIX}"
-    flops[product] = 2 * MATRIX**3
-    for precision in PRECISIONS:
-        matrix = torch.randn(MATRIX, MATRIX).to(getattr(torch, precision))
-        cases[product, precision] = partial(torch.matmul, matrix, matrix)
-    seconds = interleave(cases, repetitions, shortest=0.05, warmup=1)
+    rows = compared(cases, flops, {name: plan[-1] for name, plan in PLANS.items()}, repetitions)
     if worker is not None:
         worker.close()
+    return rows
+
+
+def compared(
+    cases: dict[tuple[str, str], Callable[[], object]],
+    flops: dict[str, float],
+    rivals: dict[str, str],
+    repetitions: int,
+) -> list[Row]:
+    """Measure plans, and large products beside them.
+
+    Args:
+        cases: by plan and implementation; ours begin with their precision.
+        flops: of each plan.
+        rivals: what ours is compared with, by plan.
+        repetitions: interleaved measurements of each case.
+
+    Returns:
+        The rows of :func:`run`.
+    """
+    product = f"product of two matrices, {MATRIX} x {MATRIX}"
+    flops = {**flops, product: 2 * MATRIX**3}
+    products = {}
+    for precision in PRECISIONS:
+        matrix = torch.randn(MATRIX, MATRIX).to(getattr(torch, precision))
+        products[product, precision] = partial(torch.matmul, matrix, matrix)
+    seconds = interleave({**cases, **products}, repetitions, shortest=0.05, warmup=1)
     rows: list[Row] = []
     for (name, implementation), values in seconds.items():
         row: Row = {"plan": name, "implementation": implementation}
         row |= spread("milliseconds", [1e3 * value for value in values])
         row |= spread("gflops", [1e-9 * flops[name] / value for value in values])
-        same = implementation if implementation in PRECISIONS else "float32"
-        fastest = 1e-9 * flops[product] / median(seconds[product, same])
+        ours = [precision for precision in PRECISIONS if implementation.startswith(precision)]
+        fastest = 1e-9 * flops[product] / median(seconds[product, (*ours, "float32")[0]])
         row["peak"] = 1e-7 * flops[name] / median(values) / fastest
-        rival = PLANS[name][3] if name in PLANS else ""
-        if implementation in PRECISIONS and (name, rival) in seconds:
+        rival = rivals.get(name, "")
+        if ours and (name, rival) in seconds:
             row |= ratio("speedup", seconds[name, rival], values)
         rows.append(row)
     return rows
@@ -188,10 +227,11 @@ def table(repetitions: int) -> Table:
         "Planning",
         f"One plan by the cross-entropy method, {CONFIG.candidates} candidates x horizon "
         f"{CONFIG.horizon} x {CONFIG.iterations} iterations, median (range): ours with hidden "
-        "layers in float32 and in bfloat16, mbrl-lib 0.2.0's `TrajectoryOptimizerAgent` and "
-        "TorchRL's `CEMPlanner`, on the same model: five Gaussian members of 3 x 200 SiLU units, "
-        "fitted to random data of HalfCheetah (17 observations, 6 actions). GFLOP/s count the "
-        "products of the model; the peak is what a large product in the same precision reaches.",
+        "layers in float32 and in bfloat16, eager or compiled, mbrl-lib 0.2.0's "
+        "`TrajectoryOptimizerAgent` and TorchRL's `CEMPlanner`, on the same model: five Gaussian "
+        "members of 3 x 200 SiLU units, fitted to random data of HalfCheetah (17 observations, "
+        "6 actions). GFLOP/s count the products of the model; the peak is what a large product in "
+        "the same precision reaches.",
         run(repetitions),
         {
             "plan": "plan",

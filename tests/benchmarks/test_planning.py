@@ -12,8 +12,9 @@ import pytest
 import torch
 from torch.nn.functional import silu, softplus
 
-from benchmarks import cheetah, fitting, peers, planning, planning_precision
+from benchmarks import cheetah, fitting, peers, planning, planning_precision, shooting
 from benchmarks.tables import Table
+from torchrl_l1.planning import compiled_motion
 
 
 @pytest.fixture
@@ -25,6 +26,11 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(planning, "CONFIG", config)
     transitions = cheetah.transitions
     monkeypatch.setattr(cheetah, "transitions", lambda *sizes: transitions(100, 20))
+    compile = torch.compile
+    monkeypatch.setattr(
+        torch, "compile", lambda function, **options: compile(function, backend="eager", **options)
+    )
+    compiled_motion._compiled.cache_clear()
 
 
 def unavailable(threads: int) -> None:
@@ -35,13 +41,43 @@ def test_planning_without_peers(small: None, monkeypatch, capsys) -> None:
     monkeypatch.setattr(peers, "Peer", unavailable)
     rows = planning.run(1)
     assert "without mbrl-lib: no network: connect" in capsys.readouterr().err
-    assert {row["implementation"] for row in rows} == {"float32", "bfloat16", "TorchRL"}
+    compiled = {"float32, compiled", "bfloat16, compiled"}
+    assert {row["implementation"] for row in rows} == compiled | {"float32", "bfloat16", "TorchRL"}
     by_name = {(row["plan"], row["implementation"]): row for row in rows}
     assert by_name["one member", "float32"]["speedup"] > 0
     assert "speedup" not in by_name["20 particles, TSinf", "float32"]
     product = by_name["product of two matrices, 32 x 32", "float32"]
     assert product["peak"] == pytest.approx(100)
     assert product["gflops"] == pytest.approx(2 * 32**3 / product["milliseconds"] / 1e6)
+
+
+def test_planning_without_a_compiler(small: None, monkeypatch, capsys) -> None:
+    def broken(*arguments: object, **options: object) -> None:
+        raise RuntimeError("no C++ compiler")
+
+    monkeypatch.setattr(peers, "Peer", unavailable)
+    monkeypatch.setattr(torch, "compile", broken)
+    rows = planning.run(1)
+    assert "without compiled plans: no C++ compiler" in capsys.readouterr().err
+    assert {row["implementation"] for row in rows} == {"float32", "bfloat16", "TorchRL"}
+
+
+def test_random_shooting(small: None, monkeypatch) -> None:
+    monkeypatch.setattr(shooting, "HIDDEN", (8, 8))
+    monkeypatch.setattr(shooting, "GRADIENT_STEPS", 1)
+    monkeypatch.setattr(shooting, "CONFIG", replace(shooting.CONFIG, horizon=3, candidates=6))
+    monkeypatch.setattr(shooting, "SINGLE", replace(shooting.SINGLE, horizon=3, candidates=6))
+    rows = shooting.run(1)
+    product = "product of two matrices, 32 x 32"
+    assert [row["plan"] for row in rows[::3]] == [*shooting.PLANS, product]
+    for row in rows[:6]:
+        assert (row.get("speedup", 0) > 0) == (row["implementation"] != "TorchRL")
+    # Products of 17 + 6 by 8, 8 by 8 and 8 by 17, for each candidate, step and member.
+    products = 2 * 8 * (23 + 8 + 17) * 6 * 3
+    for row, members in zip(rows[:6:3], (1, 5), strict=True):
+        expected = members * products / row["milliseconds"] / 1e6
+        assert row["gflops"] == pytest.approx(expected)
+    assert "TorchRL" in shooting.table(1).markdown()
 
 
 def test_fitting_without_peers(small: None, monkeypatch) -> None:
