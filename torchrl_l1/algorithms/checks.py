@@ -4,6 +4,45 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Protocol
+
+from torchrl_l1.planning import check_sampling, resolve_compilation
+
+
+class PlanSettings(Protocol):
+    """What the settings of algorithms that plan have in common."""
+
+    particles: int
+    propagation: str
+    precision: str
+    compile_plans: bool | str
+    replan_every: int
+
+
+def check_plans(settings: PlanSettings, optimizer: str, horizon: int) -> None:
+    """Refuse settings of a planner that make no sense, with a ``ValueError``.
+
+    Args:
+        settings: those of the algorithm.
+        optimizer: name of the settings that hold the horizon.
+        horizon: actions in a plan.
+    """
+    check_sampling(settings.particles, settings.propagation, settings.precision)
+    if not 1 <= settings.replan_every <= horizon:
+        raise ValueError(
+            f"replan_every must be between 1 and {optimizer}.horizon ({horizon}), got "
+            f"{settings.replan_every}"
+        )
+    try:
+        resolve_compilation(settings.compile_plans, propagation=settings.propagation)
+    except ValueError as error:
+        raise ValueError(f"compile_plans: {error}") from error
+
+
+def check_steps(name: str, value: int | None) -> None:
+    """Refuse a number of steps that is neither null nor at least one, with a ``ValueError``."""
+    if value is not None and value < 1:
+        raise ValueError(f"{name} must be at least 1 or null, got {value}")
 
 
 def check_choice(name: str, value: str, allowed: Sequence[str]) -> None:

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from copy import deepcopy
 from functools import partial
 from time import perf_counter
-from typing import Any, ClassVar
+from typing import Any
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -40,7 +40,7 @@ from torchrl_l1.control import L1Config
 from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.dynamics import make_dynamics
 from torchrl_l1.envs import get_task
-from torchrl_l1.planning import ModelPredictiveController, TrajectorySampler, resolve_precision
+from torchrl_l1.planning import ModelPredictiveController, TrajectorySampler
 
 _PHASES = ("random", "fit", "clone", "tune", "collect", "evaluate")
 
@@ -63,8 +63,6 @@ class MBMF:
             :class:`~torchrl_l1.control.L1Transform`.
         on_phase: called with a word on what is going on, for progress bars.
     """
-
-    stochastic: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -256,6 +254,7 @@ class MBMF:
             config.propagation,  # type: ignore[arg-type]
             config.precision,  # type: ignore[arg-type]
             discount=config.plan_discount,
+            compile=config.compile_plans,  # type: ignore[arg-type]
         )
         return ModelPredictiveController(
             sampler, config.shooting, *self._bounds(), replan_every=config.replan_every
@@ -278,11 +277,8 @@ class MBMF:
         }
 
     def choices(self) -> dict[str, str]:
-        """Where plans are made, and in which precision."""
-        hidden = self.dynamics.network.weights[:-1]
-        width = min((weight.shape[2] for weight in hidden), default=0)
-        precision = resolve_precision(self.config.precision, self.device, width)
-        return {"device": str(self.device), "precision": precision}
+        """Where plans are made, in which precision, and whether compiled."""
+        return {"device": str(self.device), **self.planner.sampler.choices()}
 
     def weights(self) -> dict[str, dict[str, Any]]:
         """State dicts of the model, the cloned policy and the one that PPO improves."""

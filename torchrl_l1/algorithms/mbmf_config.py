@@ -5,10 +5,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from torchrl_l1.algorithms.checks import check_choice, check_positive, check_widths
+from torchrl_l1.algorithms.checks import (
+    check_choice,
+    check_plans,
+    check_positive,
+    check_steps,
+    check_widths,
+)
 from torchrl_l1.algorithms.model_config import ModelConfig
 from torchrl_l1.dynamics import FitConfig
-from torchrl_l1.planning import ShootingConfig, check_sampling
+from torchrl_l1.planning import ShootingConfig
 
 
 @dataclass
@@ -143,6 +149,8 @@ class MBMFConfig:
             :func:`~torchrl_l1.planning.evaluate`.
         precision: of the hidden layers in planning: ``float32``, ``bfloat16``, or ``auto`` for
             what the processor multiplies fastest.
+        compile_plans: whether to compile the motion of the imagined trajectories, see
+            :func:`~torchrl_l1.planning.resolve_compilation`.
         label: action that the model is fitted to: ``nominal`` is the planner's, ``executed`` what
             L1 sends to the actuators.
         hidden: widths of the policy network's hidden layers.
@@ -153,7 +161,7 @@ class MBMFConfig:
         tuning: see :class:`TuningConfig`.
     """
 
-    outer_iterations: int = 58
+    outer_iterations: int = 59
     shooting_iterations: int = 7
     random_episodes: int = 1
     random_steps: int | None = None
@@ -166,6 +174,7 @@ class MBMFConfig:
     particles: int = 1
     propagation: str = "mean"
     precision: str = "auto"
+    compile_plans: bool | str = "auto"
     label: str = "executed"
     hidden: list[int] = field(default_factory=lambda: [64, 64])
     shooting: ShootingConfig = field(
@@ -193,20 +202,13 @@ class MBMFConfig:
         ):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("episode_steps", "random_steps"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1 or null, got {value}")
+        check_steps("episode_steps", self.episode_steps)
+        check_steps("random_steps", self.random_steps)
         if not 0 < self.plan_discount <= 1:
             raise ValueError(f"plan_discount must be in (0, 1], got {self.plan_discount}")
         if self.action_bound is not None:
             check_positive("action_bound", self.action_bound)
-        if not 1 <= self.replan_every <= self.shooting.horizon:
-            raise ValueError(
-                f"replan_every must be between 1 and shooting.horizon ({self.shooting.horizon}), "
-                f"got {self.replan_every}"
-            )
-        check_sampling(self.particles, self.propagation, self.precision)
+        check_plans(self, "shooting", self.shooting.horizon)
 
 
 def check_counts(prefix: str, settings: object, *names: str) -> None:

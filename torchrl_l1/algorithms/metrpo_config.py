@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from torchrl_l1.algorithms.checks import check_choice, check_positive, check_widths
+from torchrl_l1.algorithms.checks import (
+    check_choice,
+    check_positive,
+    check_steps,
+    check_widths,
+)
 from torchrl_l1.algorithms.model_config import ModelConfig
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.objectives import TRPOConfig
@@ -106,8 +111,7 @@ class METRPOConfig:
         """
         check_choice("label", self.label, ("nominal", "executed"))
         check_choice("box_exit", self.box_exit, ("truncate", "fail"))
-        if self.episode_steps is not None and self.episode_steps < 1:
-            raise ValueError(f"episode_steps must be at least 1 or null, got {self.episode_steps}")
+        check_steps("episode_steps", self.episode_steps)
         counts = ("outer_iterations", "episodes_per_iteration", "evaluation_episodes")
         for name in (*counts, "trpo_iterations", "imagined_horizon"):
             if getattr(self, name) < 1:

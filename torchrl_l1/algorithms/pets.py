@@ -36,12 +36,7 @@ from torchrl_l1.control import L1Config
 from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.dynamics import make_dynamics
 from torchrl_l1.envs import get_task
-from torchrl_l1.planning import (
-    ModelPredictiveController,
-    TrajectorySampler,
-    resolve_compilation,
-    resolve_precision,
-)
+from torchrl_l1.planning import ModelPredictiveController, TrajectorySampler
 
 METRICS: dict[str, str] = {
     **COMMON,
@@ -189,13 +184,7 @@ class PETS:
 
     def choices(self) -> dict[str, str]:
         """Where plans are made, in which precision, and whether compiled."""
-        hidden = self.dynamics.network.weights[:-1]
-        width = min((weight.shape[2] for weight in hidden), default=0)
-        precision = resolve_precision(self.config.precision, self.device, width)
-        config = self.config
-        fused = resolve_compilation(config.compile_plans, self.device, config.propagation)
-        plans = "compiled" if fused else "eager"
-        return {"device": str(self.device), "precision": precision, "plans": plans}
+        return {"device": str(self.device), **self.policy.sampler.choices()}
 
     def weights(self) -> dict[str, dict[str, Any]]:
         """State dict of the model: there is nothing else."""

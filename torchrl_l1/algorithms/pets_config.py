@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from torchrl_l1.algorithms.checks import check_choice
+from torchrl_l1.algorithms.checks import check_choice, check_plans, check_steps
 from torchrl_l1.algorithms.model_config import ModelConfig
 from torchrl_l1.dynamics import FitConfig
-from torchrl_l1.planning import CEMConfig, check_sampling, resolve_compilation
+from torchrl_l1.planning import CEMConfig
 
 
 @dataclass
@@ -78,17 +78,6 @@ class PETSConfig:
             raise ValueError(
                 f"evaluation_episodes must not be negative, got {self.evaluation_episodes}"
             )
-        for name in ("episode_steps", "random_steps"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1 or null, got {value}")
-        if not 1 <= self.replan_every <= self.cem.horizon:
-            raise ValueError(
-                f"replan_every must be between 1 and cem.horizon ({self.cem.horizon}), got "
-                f"{self.replan_every}"
-            )
-        check_sampling(self.particles, self.propagation, self.precision)
-        try:
-            resolve_compilation(self.compile_plans, propagation=self.propagation)
-        except ValueError as error:
-            raise ValueError(f"compile_plans: {error}") from error
+        check_steps("episode_steps", self.episode_steps)
+        check_steps("random_steps", self.random_steps)
+        check_plans(self, "cem", self.cem.horizon)

@@ -60,6 +60,14 @@ def resolve_precision(
     return "bfloat16" if native else "float32"
 
 
+def planning_precision(
+    dynamics: EnsembleDynamics, precision: str
+) -> Literal["float32", "bfloat16"]:
+    """What ``precision`` becomes for a model, see :func:`resolve_precision`."""
+    widths = [weight.shape[2] for weight in dynamics.network.weights[:-1]]
+    return resolve_precision(precision, dynamics.device, min(widths, default=0))
+
+
 @dataclass(frozen=True)
 class PlanningNetwork:
     """Weights of an ensemble's elites, copied once per plan.
@@ -110,8 +118,7 @@ class PlanningNetwork:
             ValueError: for an unknown precision.
         """
         device = dynamics.change_normalizer.mean.device
-        widths = [weight.shape[2] for weight in dynamics.network.weights[:-1]]
-        hidden = getattr(torch, resolve_precision(precision, device, min(widths, default=0)))
+        hidden = getattr(torch, planning_precision(dynamics, precision))
         elites = dynamics.elites.to(device)
         weights = [weight[elites].double() for weight in dynamics.network.weights]
         biases = [bias[elites, 0].double() for bias in dynamics.network.biases]

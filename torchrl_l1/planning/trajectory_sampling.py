@@ -13,7 +13,12 @@ from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.planning.compiled_motion import compiled_predictor, resolve_compilation
 from torchrl_l1.planning.imagined_returns import RewardFunction, Termination, imagined_returns
-from torchrl_l1.planning.network import PlanningNetwork, Precision, resolve_precision
+from torchrl_l1.planning.network import (
+    PlanningNetwork,
+    Precision,
+    planning_precision,
+    resolve_precision,
+)
 from torchrl_l1.planning.particle_draws import Draws, scenarios
 from torchrl_l1.planning.particle_motion import Propagation, predictor, shares
 from torchrl_l1.planning.sequences import Evaluate
@@ -178,6 +183,14 @@ class TrajectorySampler:
             self.discount,
             self.compile,
         )
+
+    def choices(self) -> dict[str, str]:
+        """What settings that say ``"auto"`` have become: precision, and compiled or eager plans."""
+        fused = resolve_compilation(self.compile, self.dynamics.device, self.propagation)
+        return {
+            "precision": planning_precision(self.dynamics, self.precision),
+            "plans": "compiled" if fused else "eager",
+        }
 
     def evaluator(self, observation: Tensor, generator: torch.Generator | None = None) -> Evaluate:
         """Returns ``(N, C)`` of sequences ``(N, C, H, m)`` from observations ``(N, n)``."""
