@@ -39,9 +39,9 @@ def test_loss_and_gradients_are_those_of_a_normal_distribution(
         for bound in head.parameters():
             bound += 0.5 * torch.randn(dim).double()
     raw = (scale * torch.randn(3, 5, 2 * dim).double()).requires_grad_()
-    target = torch.randn(5, dim).double()
-    variables = [raw, head.min_log_variance, head.max_log_variance]
-    log_variance = bounded(raw[..., dim:], *variables[1:])
+    target = torch.randn(5, dim).double().requires_grad_()
+    variables = [raw, head.min_log_variance, head.max_log_variance, target]
+    log_variance = bounded(raw[..., dim:], *variables[1:3])
     torch.testing.assert_close(head.log_variance(raw), log_variance, rtol=1e-7, atol=1e-7)
     normal = torch.distributions.Normal(raw[..., :dim], (0.5 * log_variance).exp())
     torch.testing.assert_close(head.standard_deviation(raw), normal.stddev, rtol=1e-7, atol=1e-7)
@@ -54,6 +54,30 @@ def test_loss_and_gradients_are_those_of_a_normal_distribution(
         gradients, torch.autograd.grad((weights * expected).sum(), variables), strict=True
     ):
         torch.testing.assert_close(gradient, other, rtol=1e-6, atol=1e-6)
+
+
+def test_gradients_under_transforms_are_the_same() -> None:
+    head = GaussianHead(2)
+    raw, target = torch.randn(6, 4), torch.randn(6, 2)
+
+    def loss(raw: Tensor, target: Tensor) -> Tensor:
+        return head.loss(raw, target).sum()
+
+    leaf = raw.clone().requires_grad_()
+    (expected,) = torch.autograd.grad(loss(leaf, target), leaf)
+    torch.testing.assert_close(torch.func.grad(loss)(raw, target), expected)
+    each = torch.func.vmap(torch.func.grad(loss))(raw, target)
+    torch.testing.assert_close(each, expected)
+
+
+def test_second_derivatives_are_refused_rather_than_wrong() -> None:
+    head = GaussianHead(2)
+    raw = torch.randn(6, 4, requires_grad=True)
+    (gradient,) = torch.autograd.grad(
+        head.loss(raw, torch.randn(6, 2)).sum(), raw, create_graph=True
+    )
+    with pytest.raises(RuntimeError, match="grad"):
+        torch.autograd.grad(gradient.sum(), raw)
 
 
 @given(

@@ -89,7 +89,8 @@ class EnsembleMLP(nn.Module):
         activation = _VALUE[self.activation]
         last = len(self.weights) - 1
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            x = torch.baddbmm(bias, x, weight)
+            # Not baddbmm, which first copies the bias to every row.
+            x = torch.bmm(x, weight).add_(bias)
             if layer < last:
                 x = activation(x)
         return x

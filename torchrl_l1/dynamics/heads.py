@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from torchrl_l1.dynamics.likelihood import NegativeLogLikelihood
+
 HEADS = ("deterministic", "gaussian")
 
 
@@ -141,9 +143,9 @@ class GaussianHead(Head):
 
     def loss(self, raw: Tensor, target: Tensor) -> Tensor:
         """Negative log-likelihood in nats, averaged over the target's columns."""
-        variance = self.variance(raw)
-        squared = (target - raw[..., : self.dim]).square() / variance
-        return 0.5 * ((squared + variance.log()).mean(-1) + math.log(2 * math.pi))
+        bounds = self.min_log_variance, self.max_log_variance
+        nll: Tensor = NegativeLogLikelihood.apply(raw, target, *bounds)[0]
+        return nll
 
     def penalty(self) -> Tensor:
         """``bound_penalty`` times the sum of the distances between upper and lower bounds."""
