@@ -136,6 +136,13 @@ def _evaluate_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
         choices=["stochastic", "deterministic"],
         help="sampled or mean actions; both by default, and sampled ones where they are the same",
     )
+    add(
+        "--stage",
+        nargs="+",
+        default=[],
+        help="stages whose policies are tested, of algorithms with several (shooting, cloning, "
+        "tuning); the last that there is by default",
+    )
     add("--episodes", type=int, default=25, help="episodes per cell and run")
     add("--seed", type=int, default=0, help="seed of resets, noise and sampled actions")
     add("--output", help="folder of the results; RUN_DIR/evaluation by default")

@@ -268,7 +268,7 @@ def test_time_left_goes_by_real_steps(
 ) -> None:
     edit(campaign_file, matrix={"episode_steps": [5, 15], "seed": [0]})
     runs = planned(campaign_file, campaign_file.parent / "out")
-    assert [this.steps_per_iteration for this in runs] == [2 * 5, 2 * 15]
+    assert [this.collected_steps(1) for this in runs] == [2 * 5, 2 * 15]
     clock = SimpleNamespace(monotonic=iter([0.0, 10.0]).__next__)
     monkeypatch.setattr(progress, "time", clock)
     monkeypatch.setattr(progress, "result", lambda this: "done")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -159,6 +160,9 @@ def test_a_users_recipe_is_found_beside_the_campaign(write: Any, tmp_path: Path)
         (RUNS + "evaluations: [{name: e, epsilon: true}]", "epsilon must be null, a number or a"),
         (RUNS + "evaluations: [{name: e, alpha: [slow]}]", "alpha must be null, a number or a"),
         (RUNS + "evaluations: [{name: e, alpha: 1.5}]", "alpha must be above 0 and at most 1"),
+        (RUNS + "evaluations: [{name: e, stage: policy}]", "stage must be a list"),
+        (RUNS + "evaluations: [{name: e, stage: [tuning]}]",
+         r"\(e\): .* no stage 'tuning'; the stages of its algorithm are policy"),
         (RUNS + "evaluations: [{name: e, where: {l1: [slow]}}]", "no run has l1=slow; there are"),
         (RUNS + "evaluations: [{name: e, where: {l2: [off]}}]", "none with a l2"),
         (RUNS + "evaluations: [{name: e}, {name: e, where: {l1: [off]}}]", "another evaluation"),
@@ -214,6 +218,22 @@ def test_no_run_of_the_switching_campaign_is_trained_twice(tmp_path: Path) -> No
     assert sum("l1=off" in str(run) for run in seen.values()) == 5
 
 
+def test_campaigns_of_mbmf_make_the_whole_table(tmp_path: Path) -> None:
+    runs = [run for name in ("mbmf", "mbmf_rest") for run in plan(read_campaign(name), tmp_path)]
+    cells = [(run.config.task, run.values["noise"], run.values["l1"]) for run in runs]
+    tasks = ("inverted_pendulum", "swimmer", "half_cheetah", "hopper", "walker")
+    noises = ("none", "action", "observation")
+    assert set(cells) == set(product(tasks, noises, ("off", "paper")))
+    assert len({run.directory.path for run in runs}) == len(runs)
+    for run in runs:
+        frozen = run.values["noise"] == "none" and run.values["l1"] == "off"
+        assert [e.stage for e in run.evaluations] == [["shooting"]] * frozen
+        pendulum = run.config.task == "inverted_pendulum"
+        assert all(e.bias == [0.0] + [1.0] * pendulum for e in run.evaluations)
+        # 200 000 real steps, as in the paper.
+        assert 190_000 < run.collected_steps(run.iterations) < 210_000
+
+
 def test_launcher_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def nothing(name: str) -> None:
         raise ModuleNotFoundError(name)
@@ -256,6 +276,8 @@ def test_shipped_campaigns_are_the_papers(capsys: pytest.CaptureFixture[str]) ->
     assert sizes["table1_first"] == 3 * 2 * 5 + 2 * 4 + 2 * 2
     assert sizes["figure2"] == 3 * 3 + 3 * 2
     assert sizes["pets"] == 2 * 2 * 2 * 5
+    assert sizes["mbmf"] == 3 * 2 * 5 + 2 * 2 * 2
+    assert sizes["mbmf_rest"] == 2 * 2 * 2 * 2 + 2 * 3 * 2 * 2
     main(["recipes"])
     shown = capsys.readouterr().out.split("Campaigns:")
     assert shown[0].split() == available_recipes()

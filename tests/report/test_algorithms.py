@@ -15,8 +15,8 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.stats import ttest_1samp
 
-from torchrl_l1.algorithms import METRPO, PETS
 from torchrl_l1.experiment.schema import SCHEMAS
+from torchrl_l1.experiment.stages import STAGES
 from torchrl_l1.report import Study, curve_panels, report
 from torchrl_l1.report.algorithm_tables import (
     algorithm_pairs,
@@ -102,11 +102,14 @@ def labels(figure: Figure) -> list[str]:
 
 def test_every_algorithm_is_known_with_its_ways_to_act() -> None:
     assert set(SCHEMAS) <= set(ALGORITHMS)
-    classes = {"metrpo": METRPO, "pets": PETS, "dets": PETS}
-    assert {name: facts(name).samples for name in ALGORITHMS} == {
-        name: kind.stochastic for name, kind in classes.items()
+    expected = {"metrpo": True, "mbmf": True, "pets": False, "dets": False}
+    assert {name: facts(name).samples for name in ALGORITHMS} == expected
+    # In the order of the stages as users type them.
+    assert [stage.name for stage in facts("mbmf").stages] == list(STAGES["mbmf"])
+    assert {name: len(facts(name).stages) > 1 for name in STAGES} == {
+        name: len(stages) > 1 for name, stages in STAGES.items()
     }
-    with pytest.raises(ValueError, match="'nothing'; there are metrpo, pets, dets"):
+    with pytest.raises(ValueError, match="'nothing'; there are metrpo, mbmf, pets, dets"):
         facts("nothing")
 
 

@@ -9,9 +9,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from torchrl_l1.report import evaluation_figures
+from torchrl_l1.report.algorithms import facts
 from torchrl_l1.report.evaluation_figures import plot_disturbances
 
-POLICIES = {"stochastic": "sampled actions", "deterministic": "mean action"}
+METRPO, MBMF = facts("metrpo"), facts("mbmf")
 
 
 def row(l1: str, bias: float = 0.0, gain: float = 1.0, **values: Any) -> dict[str, Any]:
@@ -47,8 +48,7 @@ def test_each_return_stands_above_what_l1_adds_to_it(drawn: list[Figure], tmp_pa
         *(row("off", gain=gain, return_mean=-1 / gain) for gain in (0.5, 2.0)),
     ]
     assert (
-        plot_disturbances(rows, "Task", tmp_path / "figure.png", POLICIES)
-        == tmp_path / "figure.png"
+        plot_disturbances(rows, "Task", tmp_path / "figure.png", METRPO) == tmp_path / "figure.png"
     )
     bias, gain, difference, _ = drawn[0].axes
     assert [axis.get_xlabel()[:13] for axis in (bias, gain)] == ["actuator bias", "actuator gain"]
@@ -70,7 +70,7 @@ def test_limits_beyond_what_a_return_can_be_change_no_scale(
         row("off", bias=bias, return_mean=-60 * bias, return_low=-130 * bias, return_high=10 * bias)
         for bias in (0.0, 1.0)
     ]
-    plot_disturbances(rows, "Task", tmp_path / "figure.png", POLICIES)
+    plot_disturbances(rows, "Task", tmp_path / "figure.png", METRPO)
     (axis,) = drawn[0].axes
     assert axis.get_yscale() == "symlog"
     assert axis.get_ylim()[0] < -130
@@ -78,7 +78,6 @@ def test_limits_beyond_what_a_return_can_be_change_no_scale(
 
 def test_nothing_varied_draws_nothing(tmp_path: Path) -> None:
     assert (
-        plot_disturbances([row("off", return_mean=1.0)], "Task", tmp_path / "x.png", POLICIES)
-        is None
+        plot_disturbances([row("off", return_mean=1.0)], "Task", tmp_path / "x.png", METRPO) is None
     )
     assert not (tmp_path / "x.png").exists()

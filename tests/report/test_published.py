@@ -75,6 +75,8 @@ def test_known_errata_are_marked_and_nothing_else() -> None:
             expected |= {("1", task, noise, arm, arm) for task in ("half_cheetah", "walker")}
     copied = ("swimmer", "hopper", "half_cheetah")
     expected |= {("4", task, "none", "off", "off") for task in copied}
+    for noise in ("none", "action", "observation"):
+        expected |= {("4", "walker", noise, arm, arm) for arm in ("off", "on")}
     assert marked == expected
     assert (
         "no return exceeds 0"
@@ -98,3 +100,9 @@ def test_cells_are_found_by_training_and_test() -> None:
     assert mean("swimmer", "action", "off", "none", "off") is None
     assert mean("swimmer", "none", "paper", "action", "paper") is None
     assert mean("ant", "none", "off", "none", "off") is None
+    # Of MBMF, the returns of the training are published, and no tests of frozen policies.
+    assert mean("swimmer", "action", "off", "action", "off", "mbmf") == "304.8"
+    assert mean("inverted_pendulum", "none", "paper", "none", "paper", "mbmf") == "-10.5"
+    assert mean("swimmer", "action", "paper", "action", "off", "mbmf") is None
+    assert mean("swimmer", "none", "off", "action", "off", "mbmf") is None
+    assert mean("swimmer", "none", "off", "none", "off", "pets") is None

@@ -52,6 +52,7 @@ def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
 
     Raises:
         RunDirectoryError: if the directory holds no run or no checkpoint.
+        ValueError: for a stage that the run has not; nothing is changed then.
     """
     chosen = EvaluationSettings(name=name, **settings)
     cells = conditions(
@@ -62,6 +63,7 @@ def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
         chosen.policy,
         chosen.epsilon,
         chosen.alpha,
+        chosen.stage,
     )
     trained = load_run(run_dir)
     rows = list(evaluate(trained, cells, chosen.episodes, chosen.seed))

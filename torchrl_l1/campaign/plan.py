@@ -23,6 +23,7 @@ from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run_directory import RunDirectory
 from torchrl_l1.experiment.settings import RunSettings, compile_mode, l1_config
+from torchrl_l1.experiment.stages import STAGES
 from torchrl_l1.experiment.tracking import check_mode
 
 
@@ -137,6 +138,13 @@ def _add_evaluations(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
         if not chosen:
             raise CampaignError(f"{place}: no run has all of where")
         for run in chosen:
+            stages = STAGES[run.config.algorithm]
+            unknown = [name for name in settings.stage if name not in stages]
+            if unknown:
+                raise CampaignError(
+                    f"{place}: {run} has no stage {unknown[0]!r}; the stages of its algorithm are "
+                    f"{', '.join(stages)}"
+                )
             if any(other.name == settings.name for other in run.evaluations):
                 raise CampaignError(
                     f"{place}: another evaluation of this name is for {run} too; give it another "

@@ -83,12 +83,11 @@ class Progress:
     def __init__(self, runs: Sequence[PlannedRun]) -> None:
         self._runs = runs
         self._done = {id(run): run.iterations_done() for run in runs}
-        self._steps = {id(run): run.steps_per_iteration for run in runs}
         self._ended = {id(run) for run in runs if run.finished()}
         self._to_evaluate = sum(not _is_evaluated(run) for run in runs)
         self._start = time.monotonic()
         self._first = self._steps_done()
-        self._total = sum(run.iterations * self._steps[id(run)] for run in runs)
+        self._total = sum(run.collected_steps(run.iterations) for run in runs)
         self._next = 0.0
         # No smoothing: steps of different tasks take different times, the mean is steadier.
         self._bar = tqdm(
@@ -132,7 +131,7 @@ class Progress:
         self._bar.close()
 
     def _steps_done(self) -> int:
-        return sum(count * self._steps[key] for key, count in self._done.items())
+        return sum(run.collected_steps(self._done[id(run)]) for run in self._runs)
 
     def _time_left(self) -> str:
         done = self._steps_done()

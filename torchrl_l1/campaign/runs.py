@@ -43,12 +43,11 @@ class PlannedRun:
         """Outer iterations in all."""
         return int(self.config.outer_iterations)
 
-    @property
-    def steps_per_iteration(self) -> int:
-        """Real steps that an outer iteration collects."""
+    def collected_steps(self, iterations: int) -> int:
+        """Real steps that so many outer iterations collect; random data do not count."""
         config = self.config
         full = config.horizon or get_task(config.task).horizon
-        return int(config.episodes_per_iteration * min(config.episode_steps or full, full))
+        return _episodes(config, iterations) * min(config.episode_steps or full, full)
 
     def iterations_done(self) -> int:
         """Outer iterations so far; all of them only once the run is sure to be finished."""
@@ -88,6 +87,19 @@ class PlannedRun:
         except RunDirectoryError as error:
             return str(error)
         return None
+
+
+def _episodes(config: DictConfig, iterations: int) -> int:
+    if config.algorithm != "mbmf":
+        return int(iterations * config.episodes_per_iteration)
+    shot = min(iterations, config.shooting_iterations)
+    cloned = min(iterations - shot, config.cloning.iterations)
+    # The first round of cloning learns from what has been collected already.
+    return int(
+        shot * config.shooting_episodes
+        + max(cloned - 1, 0) * config.cloning.episodes
+        + (iterations - shot - cloned) * config.tuning.episodes
+    )
 
 
 def recipe_name(recipe: str) -> str:

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_l1.experiment.l1_options import check_tuning
+from torchrl_l1.experiment.stages import KINDS
 
 # What may become part of a path and of a Hydra override without quotes.
 _PLAIN = re.compile(r"[A-Za-z0-9_.+-]+")
 _RESERVED = ("run_dir", "resume")
-_POLICIES = ("stochastic", "deterministic")
 
 
 class CampaignError(ValueError):
@@ -83,6 +83,7 @@ class EvaluationSettings:
         epsilon: tolerances of the switching law, raw state units, as a number or a list; the
             run's own if null.
         alpha: gains of the filter per step, as a number or a list; the controller's own if null.
+        stage: stages of the algorithm whose policies are tested; the last one if empty.
     """
 
     name: str
@@ -91,11 +92,12 @@ class EvaluationSettings:
     noise: list[str] = field(default_factory=lambda: ["none"])
     bias: list[float] = field(default_factory=lambda: [0.0])
     gain: list[float] = field(default_factory=lambda: [1.0])
-    policy: list[str] = field(default_factory=lambda: list(_POLICIES))
+    policy: list[str] = field(default_factory=lambda: list(KINDS))
     episodes: int = 25
     seed: int = 0
     epsilon: list[float] = field(default_factory=list)
     alpha: list[float] = field(default_factory=list)
+    stage: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         """Check types and ranges.
@@ -111,14 +113,15 @@ class EvaluationSettings:
             _check_list(f"where.{key}", values, (str, int, float), filled=True)
         for key in ("l1", "noise", "policy"):
             _check_list(key, getattr(self, key), str, filled=True)
+        _check_list("stage", self.stage, str)
         for key in ("bias", "gain"):
             _check_list(key, getattr(self, key), (int, float), filled=True)
             setattr(self, key, [float(value) for value in getattr(self, key)])
             if not all(map(math.isfinite, getattr(self, key))):
                 raise CampaignError(f"{key} must be finite, got {getattr(self, key)}")
-        unknown = [policy for policy in self.policy if policy not in _POLICIES]
+        unknown = [policy for policy in self.policy if policy not in KINDS]
         if unknown:
-            raise CampaignError(f"unknown policy {unknown[0]!r}; there are {', '.join(_POLICIES)}")
+            raise CampaignError(f"unknown policy {unknown[0]!r}; there are {', '.join(KINDS)}")
         for key, least in (("episodes", 1), ("seed", 0)):
             value = getattr(self, key)
             if not isinstance(value, int) or isinstance(value, bool) or value < least:

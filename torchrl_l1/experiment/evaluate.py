@@ -29,11 +29,12 @@ from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
 from torchrl_l1.experiment.schema import schema_of
 from torchrl_l1.experiment.settings import L1Settings, RunSettings, l1_config
+from torchrl_l1.experiment.stages import find_stage
 
 
 @dataclass(frozen=True)
 class Condition:
-    """One cell: which controller, which noise, which disturbance, which kind of policy.
+    """One cell: which controller, noise, disturbance and policy, and how this acts.
 
     Attributes:
         l1: option of the ``l1`` group.
@@ -44,6 +45,8 @@ class Condition:
         epsilon: tolerance of the switching law, raw state units; the run's own if ``None``.
         alpha: gain of the filter per step; that of the option (or of the run's own controller)
             if ``None``.
+        stage: whose policy it is, see :attr:`Algorithm.policies
+            <torchrl_l1.algorithms.algorithm.Algorithm.policies>`; the last one's if ``None``.
     """
 
     l1: str
@@ -53,6 +56,7 @@ class Condition:
     policy: str
     epsilon: float | None = None
     alpha: float | None = None
+    stage: str | None = None
 
     @property
     def controller(self) -> str:
@@ -67,6 +71,17 @@ class TrainedRun:
     path: Path
     recipe: RunSettings
     algorithm: Algorithm
+
+    def stage(self, name: str | None) -> str:
+        """The name of a stage that the run has reached, see :func:`find_stage`.
+
+        Raises:
+            ValueError: if there is no such stage, or not yet, with the run and those it has.
+        """
+        try:
+            return find_stage(self.algorithm.policies, name)
+        except ValueError as error:
+            raise ValueError(f"{self.path}: {error}") from error
 
 
 def load_run(path: str | Path) -> TrainedRun:
@@ -98,11 +113,12 @@ def conditions(
     policy: Sequence[str],
     epsilon: Sequence[float] = (),
     alpha: Sequence[float] = (),
+    stage: Sequence[str] = (),
 ) -> list[Condition]:
     """Every combination of controller, noise and policy with each bias and, apart, each gain.
 
     Every controller but ``off`` is tested with each ``epsilon`` and each ``alpha``; without
-    values, as it is.
+    values, as it is. Without a ``stage``, the last one's policy is tested.
 
     Examples:
         >>> cells = conditions(["off", "paper"], ["none"], [0.0], [1.0], ["stochastic"], [0.3, 1.0])
@@ -111,11 +127,11 @@ def conditions(
     """
     disturbances = [(b, 1.0) for b in bias] + [(0.0, g) for g in gain if g != 1.0]
     tunings = list(product(epsilon or (None,), alpha or (None,)))
-    cells = product(policy, noise, disturbances, l1)
+    cells = product(stage or (None,), policy, noise, disturbances, l1)
     return list(
         dict.fromkeys(
-            Condition(on, n, b, g, p, *tuning)
-            for p, n, (b, g), on in cells
+            Condition(on, n, b, g, p, *tuning, s)
+            for s, p, n, (b, g), on in cells
             for tuning in (tunings if on != "off" else [(None, None)])
         )
     )
@@ -131,15 +147,19 @@ def evaluate(
 
     Every condition sees the same resets and the same random numbers. Model and policy are
     those of the run's last checkpoint. ``own_l1`` is 1 where the controller is the one that the
-    run was trained with, else 0; ``epsilon`` and ``alpha`` hold what the condition sets.
+    run was trained with, else 0; ``epsilon`` and ``alpha`` hold what the condition sets. Where a
+    run has several stages, ``stage`` names the tested one.
+
+    Raises:
+        ValueError: for a stage that the run has not, before anything is evaluated.
     """
-    for cell in cells:
+    for cell in [replace(cell, stage=trained.stage(cell.stage)) for cell in cells]:
         collection = make_collection(trained, cell, episodes)
         data = collection.evaluate(seed, deterministic=cell.policy == "deterministic")
         yield {
             "run": str(trained.path),
             "training_seed": trained.recipe.seed,
-            **vars(cell),
+            **_columns(trained, cell),
             "own_l1": int(
                 same_controller(_tested_l1(trained, cell), trained.recipe.l1, trained.recipe.task)
             ),
@@ -157,12 +177,19 @@ def make_collection(trained: TrainedRun, cell: Condition, episodes: int) -> Coll
     return Collection(
         trained.algorithm.task,
         episodes,
-        trained.algorithm.collection.policy,
+        trained.algorithm.policies[trained.stage(cell.stage)],
         trained.algorithm.acting_dynamics,
         l1_config(settings, trained.recipe.task),
         perturbation,
         trained.recipe.horizon,
     )
+
+
+def _columns(trained: TrainedRun, cell: Condition) -> dict[str, Any]:
+    columns = dict(vars(cell))
+    if len(trained.algorithm.policies) == 1:
+        del columns["stage"]  # there is no choice, and nothing to say
+    return columns
 
 
 def _tested_l1(trained: TrainedRun, cell: Condition) -> L1Settings:

@@ -10,6 +10,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from torchrl_l1.experiment.evaluate import (
+    Condition,
     TrainedRun,
     conditions,
     evaluate,
@@ -21,6 +22,7 @@ from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.robustness import plot_robustness, summarize, table
 from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.experiment.settings import RunSettings, WandbSettings
+from torchrl_l1.experiment.stages import kinds_of
 
 
 def _check_one_study(runs: Sequence[TrainedRun]) -> None:
@@ -37,10 +39,46 @@ def _check_one_study(runs: Sequence[TrainedRun]) -> None:
             )
 
 
+def _stages(runs: Sequence[TrainedRun], asked: Sequence[str]) -> list[str]:
+    """The stages to evaluate: those asked for, else the last that there is.
+
+    Raises:
+        ValueError: for one that a run has not, or if the last is not the same in all runs.
+    """
+    names = asked or (None,)
+    found = [list(dict.fromkeys(map(trained.stage, names))) for trained in runs]
+    for trained, stages in zip(runs, found, strict=True):
+        if stages != found[0]:
+            raise ValueError(
+                f"{runs[0].path} has reached the stage {found[0][0]} and {trained.path} "
+                f"{stages[0]}; say with --stage which one to evaluate"
+            )
+    return found[0]
+
+
+def _cells(
+    options: argparse.Namespace, trained: TrainedRun, stages: Sequence[str]
+) -> list[Condition]:
+    """All conditions; where the kind of policy is left open, those kinds that differ."""
+    return [
+        cell
+        for stage in stages
+        for cell in conditions(
+            options.l1,
+            options.noise,
+            options.bias,
+            options.gain,
+            options.policy or kinds_of(trained.algorithm.policies[stage]),
+            options.epsilon,
+            options.alpha,
+            [stage],
+        )
+    ]
+
+
 def evaluate_command(options: argparse.Namespace) -> None:
     """``torchrl-l1 evaluate``: table on the screen, CSV, PNG and, if asked, a filmstrip."""
-    tuning = (options.epsilon, options.alpha)
-    check_tuning(*tuning, prefix="--")
+    check_tuning(options.epsilon, options.alpha, prefix="--")
     for name in options.l1:
         group_setting("l1", name)
     for name in options.noise:
@@ -49,10 +87,8 @@ def evaluate_command(options: argparse.Namespace) -> None:
         raise ValueError(f"--episodes must be positive, got {options.episodes}")
     runs = [load_run(path) for path in dict.fromkeys(map(Path, options.run_dir))]
     _check_one_study(runs)
-    policies = options.policy or (
-        ["stochastic", "deterministic"] if runs[0].algorithm.stochastic else ["stochastic"]
-    )
-    cells = conditions(options.l1, options.noise, options.bias, options.gain, policies, *tuning)
+    stages = _stages(runs, options.stage)
+    cells = _cells(options, runs[0], stages)
     output = Path(options.output) if options.output else runs[0].path / "evaluation"
     rows = []
     total = len(runs) * len(cells)
@@ -72,5 +108,7 @@ def evaluate_command(options: argparse.Namespace) -> None:
     print(f"Plot: {output / 'robustness.png'}")
     if options.filmstrip:
         worst = max(options.bias, key=abs)
-        shown = conditions(options.l1, ["none"], [worst], [1.0], ["deterministic"], *tuning)
+        tuning = (options.epsilon, options.alpha)
+        kind = ["deterministic"]
+        shown = conditions(options.l1, ["none"], [worst], [1.0], kind, *tuning, stages)
         write_filmstrip(runs[0], shown, options.seed, output)

@@ -28,17 +28,16 @@ def write_filmstrip(
 ) -> None:
     """Render one deterministic episode per condition into ``filmstrip.png`` and ``.gif``.
 
-    The conditions share their disturbance; rows are named by their controllers. Where no
-    headless OpenGL works, a line says so and nothing is written.
+    The conditions share their disturbance; rows are named by their controllers, and by their
+    stages where there are several. Where no headless OpenGL works, a line says so and nothing is
+    written.
     """
     task = trained.algorithm.task
+    several = len({cell.stage for cell in cells}) > 1
     steps = min(trained.recipe.horizon or task.horizon, round(_SECONDS_SHOWN / task.dt))
     try:
         rows = {
-            # A line for each value that is set: a row is not wide.
-            "L1 " + cell.controller.replace(" ", "\n"): rollout_frames(
-                task, _poses(trained, cell, steps, seed)
-            )
+            _label(cell, several): rollout_frames(task, _poses(trained, cell, steps, seed))
             for cell in cells
         }
     except RenderingUnavailable as error:
@@ -47,6 +46,12 @@ def write_filmstrip(
     strip = filmstrip(rows, output / "filmstrip.png", every=max(1, steps // _COLUMNS), dt=task.dt)
     moving = animation(rows, output / "rollout.gif", dt=task.dt)
     print(f"Filmstrip at bias {cells[0].bias:g}: {strip}, animation: {moving}")
+
+
+def _label(cell: Condition, several: bool) -> str:
+    """A line for each value that is set: a row is not wide."""
+    controller = "L1 " + cell.controller.replace(" ", "\n")
+    return f"{cell.stage}\n{controller}" if several else controller
 
 
 def _poses(trained: TrainedRun, cell: Condition, steps: int, seed: int) -> np.ndarray:

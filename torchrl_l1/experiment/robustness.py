@@ -15,24 +15,27 @@ from matplotlib.axes import Axes
 
 from torchrl_l1.experiment.l1_options import controller_label
 
-_CELL = ("policy", "noise", "bias", "gain", "l1")
+_PANEL = ("stage", "policy", "noise")
+_CELL = (*_PANEL, "bias", "gain", "l1")
 
 
 def summarize(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Median, lowest and highest mean return over the training seeds, per condition.
 
-    A controller is named by its option and the values that the test has set.
+    A controller is named by its option and the values that the test has set. Only where rows
+    have a ``stage`` has the summary.
     """
     groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for row in rows:
         name = controller_label(row["l1"], row.get("epsilon"), row.get("alpha"))
-        named = {**row, "l1": name}
+        named = {"stage": None, **row, "l1": name}
         groups.setdefault(tuple(named[key] for key in _CELL), []).append(row)
     summary = []
     for cell, members in groups.items():
         returns = [float(row["return_mean"]) for row in members]
+        named = {k: v for k, v in zip(_CELL, cell, strict=True) if (k, v) != ("stage", None)}
         entry = {
-            **dict(zip(_CELL, cell, strict=True)),
+            **named,
             "training_seeds": len(members),
             "episodes_per_seed": members[0]["episodes"],
             "return_median": median(returns),
@@ -51,14 +54,14 @@ def table(summary: Sequence[Mapping[str, Any]]) -> str:
     controllers = list(dict.fromkeys(row["l1"] for row in summary))
     width = max(34, 2 + max(map(len, controllers), default=0))
     lines = []
-    keys = dict.fromkeys((r["policy"], r["noise"], r["bias"], r["gain"]) for r in summary)
+    keys = dict.fromkeys((_panel(r), r["bias"], r["gain"]) for r in summary)
     heading = None
-    for policy, noise, bias, gain in keys:
-        if heading != (policy, noise):
-            heading = (policy, noise)
+    for panel, bias, gain in keys:
+        if heading != panel:
+            heading = panel
             seeds = summary[0]["training_seeds"]
             lines.append(
-                f"\n{policy} policy, noise {noise}: mean return, "
+                f"\n{_panel_words(panel, ' policy, noise ')}: mean return, "
                 f"median [lowest, highest] of {seeds} training seed{'s' * (seeds > 1)}"
             )
             lines.append(f"{'bias':>7}{'gain':>7}" + "".join(f"{c:>{width}}" for c in controllers))
@@ -67,8 +70,7 @@ def table(summary: Sequence[Mapping[str, Any]]) -> str:
             row = next(
                 r
                 for r in summary
-                if (r["policy"], r["noise"], r["bias"], r["gain"], r["l1"])
-                == (policy, noise, bias, gain, controller)
+                if (_panel(r), r["bias"], r["gain"], r["l1"]) == (panel, bias, gain, controller)
             )
             spread = f"[{row['return_lowest']:.4g}, {row['return_highest']:.4g}]"
             cells += f"{row['return_median']:>{width - 23}.4g} {spread:>22}"
@@ -76,18 +78,28 @@ def table(summary: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def _panel(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    return tuple(row.get(key) for key in _PANEL)
+
+
+def _panel_words(panel: tuple[Any, ...], between: str) -> str:
+    stage, policy, noise = panel
+    return f"{stage}, " * bool(stage) + f"{policy}{between}{noise}"
+
+
 def plot_robustness(summary: Sequence[Mapping[str, Any]], file: Path, title: str) -> None:
     """Return against actuator bias and against gain, one line per controller.
 
-    A panel per kind of disturbance and per policy and noise; the band spans the training seeds.
+    A panel per kind of disturbance and per stage, policy and noise; the band spans the training
+    seeds.
     """
     panels = []
-    for policy, noise in dict.fromkeys((r["policy"], r["noise"]) for r in summary):
-        rows = [r for r in summary if (r["policy"], r["noise"]) == (policy, noise)]
+    for panel in dict.fromkeys(map(_panel, summary)):
+        rows = [r for r in summary if _panel(r) == panel]
         for axis_name, other, neutral in (("bias", "gain", 1.0), ("gain", "bias", 0.0)):
             chosen = [r for r in rows if r[other] == neutral]
             if len({r[axis_name] for r in chosen}) > 1 or (axis_name == "bias" and chosen):
-                panels.append((f"{policy} policy, noise: {noise}", axis_name, chosen))
+                panels.append((_panel_words(panel, " policy, noise: "), axis_name, chosen))
     figure, axes = plt.subplots(
         1, len(panels), figsize=(5.2 * len(panels), 4.2), squeeze=False, constrained_layout=True
     )

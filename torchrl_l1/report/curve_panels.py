@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,12 @@ from torchrl_l1.report.reference_curves import Curves
 from torchrl_l1.report.runs import Run
 from torchrl_l1.report.style import fit_scale, grid, legend_below, save
 
-__all__ = ["Grey", "Line", "Panel", "plot_panels"]
+__all__ = ["Band", "Grey", "Line", "Panel", "plot_panels"]
 
 # Trainings that differ more in length are drawn over a logarithmic axis.
 _MOST_TIMES = 5
+
+_SHADES = ("0.82", "0.91")
 
 
 @dataclass(frozen=True)
@@ -49,21 +51,49 @@ class Grey:
 
 
 @dataclass(frozen=True)
+class Band:
+    """A part of the training in a panel, from one number of real steps to another."""
+
+    label: str
+    start: float
+    end: float
+
+
+@dataclass(frozen=True)
 class Panel:
-    """What is drawn in the same axes."""
+    """What is drawn in the same axes.
+
+    Attributes:
+        heading: title of the panel.
+        lines: our curves.
+        authors: curves behind them.
+        bands: parts of the training to be shaded.
+        stage: position of the stage that is drawn, see :meth:`Run.during`; all of them if ``None``.
+    """
 
     heading: str
     lines: Sequence[Line]
     authors: Sequence[Grey] = ()
+    bands: Sequence[Band] = ()
+    stage: int | None = None
 
     def begun(self) -> Panel:
         """The panel with those lines only that have something to draw."""
         lines = [line for line in self.lines if any(len(run.returns) for run in line.runs)]
-        return Panel(self.heading, lines, self.authors)
+        return replace(self, lines=lines)
+
+    def part(self, run: Run) -> np.ndarray | slice:
+        """Which outer iterations of a run are drawn."""
+        return slice(None) if self.stage is None else run.during(self.stage)
 
 
-def plot_panels(panels: Sequence[Panel], file: Path) -> Path | None:
+def plot_panels(panels: Sequence[Panel], file: Path, same_scale: bool = False) -> Path | None:
     """A figure of some panels with one legend.
+
+    Args:
+        panels: the panels.
+        file: where to.
+        same_scale: whether all show the same range of returns.
 
     Returns:
         the file, or ``None`` if no run has finished an iteration.
@@ -76,8 +106,13 @@ def plot_panels(panels: Sequence[Panel], file: Path) -> Path | None:
     for axis, panel in zip(axes, begun, strict=True):
         shown += _draw(axis, panel)
         axis.set_title(panel.heading, fontsize=10)
+    if same_scale:
+        low, high = zip(*(axis.get_ylim() for axis in axes), strict=True)
+        for axis in axes:
+            axis.set_ylim(min(low), max(high))
     fit_scale(axes, shown)
-    legend_below(figure, axes, last=("mean action", "unfinished", "authors"))
+    bands = dict.fromkeys(band.label for panel in begun for band in panel.bands)
+    legend_below(figure, axes, last=("mean action", "unfinished", "authors", *bands))
     return save(figure, file)
 
 
@@ -94,22 +129,34 @@ def _draw(axis: Axes, panel: Panel) -> list[np.ndarray]:
         shown.append(values[steps <= end])
     for line in panel.lines:
         for run in line.runs:
-            style = line.style if run.finished else ":"
-            _line(axis, run.real_steps, run.returns, style, line.color, 0.8, alpha=0.5)
-            shown.append(run.returns)
+            style, part = line.style if run.finished else ":", panel.part(run)
+            steps, values = run.real_steps[part], run.returns[part]
+            _line(axis, steps, values, style, line.color, 0.8, alpha=0.5, marker=_dots(steps))
+            shown.append(values)
             if not run.finished:
                 axis.plot([], [], ":", color="0.2", linewidth=0.8, label="unfinished run")
         done = [run for run in line.runs if run.finished]
         if done:
-            steps = np.mean([run.real_steps for run in done], axis=0)
-            means = np.mean([run.returns for run in done], axis=0)
-            _line(axis, steps, means, line.style, line.color, 2.2, label=line.label)
+            steps, means, mean_action = np.mean(
+                [
+                    [values[panel.part(r)] for values in (r.real_steps, r.returns, r.deterministic)]
+                    for r in done
+                ],
+                axis=0,
+            )
+            dots = _dots(steps)
+            _line(axis, steps, means, line.style, line.color, 2.2, label=line.label, marker=dots)
             if line.mean_action:
-                means = np.mean([run.deterministic for run in done], axis=0)
-                _line(axis, steps, means, "--", line.color, 1.4)
+                _line(axis, steps, mean_action, "--", line.color, 1.4)
                 axis.plot([], [], "--", color="0.2", linewidth=1.4, label="mean action")
-                shown.append(means)
-    if end > _MOST_TIMES * min(ends):
+                shown.append(mean_action)
+    for band, shade in zip(panel.bands, _SHADES, strict=False):
+        axis.axvspan(
+            band.start / 1000, band.end / 1000, color=shade, linewidth=0, zorder=0, label=band.label
+        )
+    if panel.stage is not None:
+        axis.margins(x=0.03)
+    elif end > _MOST_TIMES * min(ends):
         axis.set_xscale("log")
         axis.xaxis.set_major_formatter("{x:g}")
         axis.set_xlim(right=end / 1000 * 1.05)
@@ -119,6 +166,11 @@ def _draw(axis: Axes, panel: Panel) -> list[np.ndarray]:
     axis.set_ylabel("return (sum of rewards)")
     axis.grid(alpha=0.3)
     return shown
+
+
+def _dots(steps: np.ndarray) -> str:
+    """A single point makes no line."""
+    return "o" if len(steps) == 1 else ""
 
 
 def _line(

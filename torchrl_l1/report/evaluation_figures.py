@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from torchrl_l1.report.algorithms import AlgorithmFacts
 from torchrl_l1.report.evaluation_tables import PHASES
 from torchrl_l1.report.style import (
     arm_label,
@@ -32,7 +33,7 @@ def plot_ablation(rows: Sequence[Row], file: Path, name: str = "") -> Path:
 
     Args:
         rows: of :func:`~torchrl_l1.report.evaluation_tables.ablation_rows`, of one kind of policy,
-            one kind of L1 and one variant.
+            one kind of L1, one variant and one stage.
         file: where to.
         name: of the algorithm, where there are several.
     """
@@ -50,7 +51,8 @@ def plot_ablation(rows: Sequence[Row], file: Path, name: str = "") -> Path:
         axis.set_xticks(range(len(noises)), [f"noise: {noise}" for noise in noises])
         axis.set_xlim(-0.6, len(noises) - 0.4)
         axis.set_ylabel("return (sum of rewards)")
-        axis.set_title(named(name, title(task)), fontsize=10)
+        words = filter(None, (title(task), mine[0].get("stage", "")))
+        axis.set_title(named(name, ", ".join(words)), fontsize=10)
         axis.grid(axis="y", alpha=0.3)
     legend_below(figure, axes)
     return save(figure, file)
@@ -69,7 +71,7 @@ def _bar(axis: Axes, x: float, row: Row, shade: str) -> None:
 
 
 def plot_disturbances(
-    rows: Sequence[Row], heading: str, file: Path, policies: Mapping[str, str]
+    rows: Sequence[Row], heading: str, file: Path, algorithm: AlgorithmFacts
 ) -> Path | None:
     """Return against actuator bias and against actuator gain, and what L1 adds to it.
 
@@ -81,21 +83,19 @@ def plot_disturbances(
         rows: of one training cell, tested under several biases and gains.
         heading: title of the figure.
         file: where to.
-        policies: the kinds of policies in words.
+        algorithm: what the policies are of.
 
     Returns:
         the file, or ``None`` if neither bias nor gain varies.
     """
     found: list[tuple[str, str, list[Row]]] = []
-    for policy, noise in dict.fromkeys((row["policy"], row["noise"]) for row in rows):
+    for what_acts in dict.fromkeys(map(_acting, rows)):
+        stage, policy, noise = what_acts
         for what, other, neutral in (("bias", "gain", 1.0), ("gain", "bias", 0.0)):
-            chosen = [
-                row
-                for row in rows
-                if (row["policy"], row["noise"], row[other]) == (policy, noise, neutral)
-            ]
+            chosen = [row for row in rows if _acting(row) == what_acts and row[other] == neutral]
             if len({row[what] for row in chosen}) > 1:
-                found.append((_panel_title(policies[policy], noise), what, chosen))
+                name = _panel_title(algorithm.acting(policy, stage), noise)
+                found.append((name, what, chosen))
     if not found:
         return None
     # All panels of a column vary the same; returns and differences take turns down the rows.
@@ -120,6 +120,10 @@ def plot_disturbances(
     figure.suptitle(heading, fontsize=11)
     legend_below(figure, axes)
     return save(figure, file)
+
+
+def _acting(row: Row) -> tuple[str, str, str]:
+    return row.get("stage", ""), row["policy"], row["noise"]
 
 
 def _panel_title(actions: str, noise: str) -> str:

@@ -45,7 +45,7 @@ def _sim_to_real(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> 
     page.heading(
         "Sim to real",
         "Policies and models trained without noise, frozen and tested with it, L1 off and on"
-        + " (the paper's Table 2)" * algorithm.published
+        + " (the paper's Table 2)" * algorithm.released
         + ": mean ± standard deviation over training seeds, 95 % interval of "
         "the mean; differences are taken policy by policy.",
     )
@@ -56,20 +56,25 @@ def _ablation(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> Non
     page.heading(
         "Ablation",
         "L1 in neither phase, in one of them, or in both"
-        + " (the paper's Table 5 and ablation figure)" * algorithm.published
+        + " (the paper's Table 5 and ablation figure)" * algorithm.released
         + ": bars are means, dots training seeds, lines 95 % intervals.",
     )
     for l1 in sorted({row["training_l1"] for row in rows} - {BASELINE}):
         mine = [row for row in rows if {row["training_l1"], row["l1"]} <= {BASELINE, l1}]
-        for policy, actions in algorithm.policies.items():
+        for policy in algorithm.policies:
             chosen = [row for row in mine if row["policy"] == policy]
             if chosen:
-                page.text(f"{_listed(f'L1 {l1}', actions)}:", ablation_table(chosen))
-        for variant in dict.fromkeys(row["variant"] for row in mine):
-            chosen = [r for r in mine if (r["variant"], r["policy"]) == (variant, "stochastic")]
+                words = _listed(f"L1 {l1}", _actions(algorithm, policy, chosen))
+                page.text(f"{words}:", ablation_table(chosen))
+        for variant, stage in dict.fromkeys((row["variant"], _stage(row)) for row in mine):
+            chosen = [
+                row
+                for row in mine
+                if (row["variant"], _stage(row), row["policy"]) == (variant, stage, "stochastic")
+            ]
             if chosen:
-                file = page.file("ablation", l1, variant)
-                caption = _listed(f"Ablation, L1 {l1}", variant)
+                file = page.file("ablation", l1, variant, stage)
+                caption = _listed(f"Ablation, L1 {l1}", variant, stage)
                 page.figure(plot_ablation(chosen, file, page.name), caption)
 
 
@@ -81,8 +86,10 @@ def _disturbances(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) ->
         "difference to the same policies without L1 with the interval of its mean.",
     )
     for heading, words, chosen in _training_cells(rows):
+        stage = _stage(chosen[0])
+        heading += f", stage {stage}" * bool(stage)
         file = page.file("disturbances", *words)
-        drawn = plot_disturbances(chosen, named(page.name, heading), file, algorithm.policies)
+        drawn = plot_disturbances(chosen, named(page.name, heading), file, algorithm)
         page.figure(drawn, heading)
 
 
@@ -91,8 +98,10 @@ def _tuning(page: Page, algorithm: AlgorithmFacts, name: str, rows: Sequence[Row
     explained = False
     for heading, words, chosen in _training_cells(rows):
         policy, swept = tuning_rows(chosen)
-        actions = f"{'the ' * (policy == 'deterministic')}{algorithm.policies[policy]}"
-        caption = f"{heading}; tested with {actions}" if actions else heading
+        acting = algorithm.acting(policy, _stage(chosen[0])).replace(
+            "mean action", "the mean action"
+        )
+        caption = f"{heading}; tested with {acting}" if acting else heading
         file = page.file("sweep", name, *words)
         drawn = plot_tuning(swept, named(page.name, caption), file)
         if drawn is not None and not explained:
@@ -106,13 +115,17 @@ def _tuning(page: Page, algorithm: AlgorithmFacts, name: str, rows: Sequence[Row
 
 
 def _training_cells(rows: Sequence[Row]) -> Iterator[tuple[str, tuple[str, ...], list[Row]]]:
-    """The rows of each cell of the training, with a heading and its words."""
-    cells = ("task", "training_noise", "training_l1", "variant")
-    for cell in dict.fromkeys(tuple(row[key] for key in cells) for row in rows):
-        task, noise, l1, variant = cell
+    """The rows of each cell and stage of the training, with a heading and the words of a file."""
+
+    def place(row: Row) -> tuple[str, ...]:
+        keys = ("task", "training_noise", "training_l1", "variant")
+        return (*(row[key] for key in keys), _stage(row))
+
+    for cell in dict.fromkeys(map(place, rows)):
+        task, noise, l1, variant, _ = cell
         heading = f"{title(task)}: trained with {noise_words(noise)} and {arm_label(l1)}"
         heading += f" ({variant})" * bool(variant)
-        yield heading, cell, [row for row in rows if tuple(row[key] for key in cells) == cell]
+        yield heading, cell, [row for row in rows if place(row) == cell]
 
 
 def _other(name: str) -> Section:
@@ -130,13 +143,24 @@ def _other(name: str) -> Section:
 def _evaluation_tables(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> None:
     """A table per L1 setting of the training and kind of policy."""
     for l1 in dict.fromkeys(row["training_l1"] for row in rows):
-        for policy, actions in algorithm.policies.items():
+        for policy in algorithm.policies:
             chosen = [r for r in rows if (r["training_l1"], r["policy"]) == (l1, policy)]
             if chosen and len(chosen) <= _MOST_ROWS:
+                actions = _actions(algorithm, policy, chosen)
                 words = _listed(f"Trained with {arm_label(l1)}", actions)
                 swept = any("option" in row for row in chosen)
                 table = tuning_table if swept else evaluation_table
                 page.text(f"{words}:", table(chosen))
+
+
+def _actions(algorithm: AlgorithmFacts, policy: str, rows: Sequence[Row]) -> str:
+    """How policies act that have a choice, in words; nothing where all are planners."""
+    planned = all(algorithm.plans(_stage(row)) for row in rows)
+    return "" if planned else algorithm.policies[policy]
+
+
+def _stage(row: Row) -> str:
+    return str(row.get("stage", ""))
 
 
 def _listed(*words: str) -> str:

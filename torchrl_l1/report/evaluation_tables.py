@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_l1.report.algorithms import facts
 from torchrl_l1.report.published import published_cell
 from torchrl_l1.report.runs import Evaluation, Run
 from torchrl_l1.report.settings import BASELINE
@@ -19,7 +20,7 @@ __all__ = ["PHASES", "ablation_rows", "evaluation_names", "evaluation_rows"]
 PHASES = ("neither", "training only", "testing only", "both")
 """Where L1 is on, in the order in which tables and figures show it."""
 
-_CONDITION = ("l1", "noise", "bias", "gain", "policy")
+_CONDITION = ("l1", "noise", "bias", "gain", "policy", "stage")
 
 Key = tuple[Any, ...]
 
@@ -37,7 +38,8 @@ def evaluation_rows(study: Study, name: str) -> list[dict[str, Any]]:
     the same policies tested without L1. Runs that are not finished are left out. Where ``l1``
     is equal to ``training_l1`` the policy was tested with the controller of its training;
     another controller of that name is marked. Where the test has set values of the controller,
-    ``l1`` names them, and ``option``, ``epsilon`` and ``alpha`` hold them.
+    ``l1`` names them, and ``option``, ``epsilon`` and ``alpha`` hold them. ``stage`` is there
+    where a test names it.
     """
     rows = []
     for cell, runs in study.cells.items():
@@ -47,7 +49,8 @@ def evaluation_rows(study: Study, name: str) -> list[dict[str, Any]]:
             for test in run.evaluations[name]:
                 key = (_tested(run, test), *test.condition[1:])
                 tests.setdefault(key, []).append((run, test))
-        for key in sorted(tests, key=lambda key: _order(key, tests[key][0][1])):
+        places = {key: study.facts.position(key[-1]) for key in tests}
+        for key in sorted(tests, key=lambda key: (places[key], _order(key, tests[key][0][1]))):
             rows.append(
                 {
                     "task": cell.task,
@@ -61,6 +64,9 @@ def evaluation_rows(study: Study, name: str) -> list[dict[str, Any]]:
                     **_published(runs[0], key),
                 }
             )
+    if not any(row["stage"] for row in rows):
+        for row in rows:
+            del row["stage"]
     return rows
 
 
@@ -134,16 +140,17 @@ def _against_baseline(
 
 
 def _published(run: Run, key: Key) -> dict[str, str]:
-    l1, noise, bias, gain, policy = key
+    l1, noise, bias, gain, policy, _ = key
     what = run.identity
-    if (bias, gain, policy) != (0.0, 1.0, "stochastic") or not what.as_published:
+    usual = (bias, gain, policy) == (0.0, 1.0, "stochastic")
+    if not (usual and what.as_published and facts(what.algorithm).released):
         return {}
     cell = published_cell(what.task, what.noise, what.arm, noise, l1)
     return {} if cell is None else cell.columns()
 
 
 def _order(key: Key, test: Evaluation) -> Key:
-    l1, noise, bias, gain, policy = key
+    l1, noise, bias, gain, policy, _ = key
     # By the values, where their texts would put 10 before 3.
     controller = (test.l1, test.epsilon or 0.0, test.alpha or 0.0) if test.tuned else (l1, 0.0, 0.0)
     return policy != "stochastic", noise_order(noise), bias, gain, l1 != BASELINE, controller

@@ -15,7 +15,7 @@ from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
 from torchrl_l1.report.algorithms import facts
 from torchrl_l1.report.reading import (
     SIGNALS,
-    one_policy,
+    distinct_policies,
     read_evaluations,
     read_metrics,
     read_seconds,
@@ -94,7 +94,7 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
         algorithm = facts(identity.algorithm)
     except (KeyError, TypeError, ValueError) as error:
         raise RunDirectoryError(f"cannot use {directory.config_file}: {error}") from error
-    columns = read_metrics(directory.metrics_file)
+    columns = read_metrics(directory.metrics_file, len(algorithm.stages))
     iterations = len(columns["iteration"])
     if iterations > identity.outer_iterations:
         raise RunDirectoryError(
@@ -126,9 +126,6 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
             {phase: np.full(iterations, np.nan) for phase in algorithm.phases},
         ),
         readable(partial(read_versions, path / "versions.json"), {}),
-        {
-            name: tests if algorithm.samples else one_policy(tests)
-            for name, tests in evaluations.items()
-            if tests
-        },
+        {k: distinct_policies(tests, algorithm) for k, tests in evaluations.items() if tests},
+        columns.get("stage"),
     )

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from torchrl_l1.report.curve_panels import Grey, Line, Panel, plot_panels
+from torchrl_l1.report.curve_panels import Band, Grey, Line, Panel, plot_panels
 from torchrl_l1.report.reference_curves import ReferenceCurves
 from torchrl_l1.report.settings import BASELINE
 from torchrl_l1.report.style import (
@@ -19,7 +19,7 @@ from torchrl_l1.report.style import (
 )
 from torchrl_l1.report.variants import Cell, Study
 
-__all__ = ["plot_algorithms", "plot_comparison", "plot_task"]
+__all__ = ["plot_algorithms", "plot_comparison", "plot_stages", "plot_task"]
 
 
 def plot_task(
@@ -41,17 +41,26 @@ def plot_task(
     Returns:
         the file, or ``None`` if no run has finished an iteration.
     """
-    cells = [cell for cell in study.cells if cell.task == task and not cell.variant]
     panels = []
-    for noise in dict.fromkeys(cell.noise for cell in cells):
-        chosen = [cell for cell in cells if cell.noise == noise]
-        lines = [
-            _line(study, cell, arm_label(cell.arm), color(3 + i, cell.arm))
-            for i, cell in enumerate(chosen)
-        ]
+    for noise, lines in _main_lines(study, task):
         heading = named(name, title(task, noise))
-        panels.append(Panel(heading, lines, _authors(reference, task, noise)))
+        authors = _authors(reference, task, noise)
+        panels.append(Panel(heading, lines, authors, _stages(study, lines)[:-1]))
     return plot_panels(panels, file)
+
+
+def plot_stages(study: Study, task: str, file: Path, name: str = "") -> Path | None:
+    """The same cells with a panel for each noise and stage: the first stages are short.
+
+    Returns:
+        the file, or ``None`` if no run has finished an iteration.
+    """
+    panels = []
+    for noise, lines in _main_lines(study, task):
+        for position, band in enumerate(_stages(study, lines)):
+            heading = f"{named(name, title(task, noise))}: {band.label}"
+            panels.append(Panel(heading, lines, stage=position))
+    return plot_panels(panels, file, same_scale=True)
 
 
 def plot_comparison(
@@ -120,6 +129,31 @@ def plot_algorithms(
 
 def _line(study: Study, cell: Cell, label: str, shade: str) -> Line:
     return Line(label, shade, study.cells[cell], mean_action=study.facts.samples)
+
+
+def _main_lines(study: Study, task: str) -> Iterator[tuple[str, list[Line]]]:
+    """A line for each main cell of a task, by noise."""
+    cells = [cell for cell in study.cells if cell.task == task and not cell.variant]
+    for noise in dict.fromkeys(cell.noise for cell in cells):
+        chosen = [cell for cell in cells if cell.noise == noise]
+        yield (
+            noise,
+            [
+                _line(study, cell, arm_label(cell.arm), color(3 + i, cell.arm))
+                for i, cell in enumerate(chosen)
+            ],
+        )
+
+
+def _stages(study: Study, lines: Sequence[Line]) -> list[Band]:
+    """Where the stages are, in the run that is furthest; none where there is one stage only."""
+    furthest = max((run for line in lines for run in line.runs), key=lambda run: len(run.returns))
+    bands: list[Band] = []
+    for position, stage in enumerate(study.facts.stages):
+        steps = furthest.real_steps[furthest.during(position)]
+        if len(steps):
+            bands.append(Band(stage.words, bands[-1].end if bands else 0.0, float(steps[-1])))
+    return bands
 
 
 def _name(study: Study, cell: Cell, keys: Sequence[str]) -> str:

@@ -12,7 +12,11 @@ __all__ = ["numeric_rows"]
 
 
 def numeric_rows(
-    file: Path, numbers: Sequence[str], words: Sequence[str] = (), optional: Sequence[str] = ()
+    file: Path,
+    numbers: Sequence[str],
+    words: Sequence[str] = (),
+    optional: Sequence[str] = (),
+    optional_words: Sequence[str] = (),
 ) -> list[dict[str, Any]]:
     """Some columns of a CSV file.
 
@@ -21,6 +25,7 @@ def numeric_rows(
         numbers: columns of finite numbers.
         words: columns of text that must not be empty.
         optional: columns of numbers that may be absent, empty or not finite: NaN then.
+        optional_words: columns of text that may be absent or empty.
 
     Raises:
         ValueError: if the file cannot be read, a column is missing, or a cell holds something
@@ -40,6 +45,7 @@ def numeric_rows(
             **{key: _word(file, line, key, row[key]) for key in words},
             **{key: _number(file, line, key, row[key]) for key in numbers},
             **{key: _value(row.get(key)) for key in optional},
+            **{key: row.get(key) or "" for key in optional_words},
         }
         for line, row in enumerate(rows, start=2)
     ]

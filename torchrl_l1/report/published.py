@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 
+from torchrl_l1.report.algorithms import facts
 from torchrl_l1.report.settings import BASELINE
 
 __all__ = ["PublishedCell", "published_cell", "published_cells"]
@@ -58,9 +59,14 @@ def published_cells() -> dict[tuple[str, str, str, str, str], PublishedCell]:
 
 
 def published_cell(
-    task: str, training_noise: str, trained: str, testing_noise: str, tested: str
+    task: str,
+    training_noise: str,
+    trained: str,
+    testing_noise: str,
+    tested: str,
+    algorithm: str = "metrpo",
 ) -> PublishedCell | None:
-    """What the paper's METRPO tables say of a training and a test; ``None`` if nothing.
+    """What the paper's tables say of a training and a test; ``None`` if nothing.
 
     Args:
         task: the task.
@@ -68,20 +74,29 @@ def published_cell(
         trained: L1 setting of the training.
         testing_noise: noise of the test; that of the training in a run's own returns.
         tested: L1 setting of the test.
+        algorithm: see :data:`~torchrl_l1.report.algorithms.ALGORITHMS`. Of MBMF there are only the
+            returns of the training.
 
     Examples:
         >>> published_cell("swimmer", "none", "off", "none", "off").mean
         '309.5'
         >>> published_cell("swimmer", "none", "off", "action", "paper").source
         'arXiv 2403.14860, Table 2'
+        >>> published_cell("swimmer", "none", "paper", "none", "paper", "mbmf").mean
+        '314.3'
     """
     switches = []
     for arm in (trained, tested):
         if arm != BASELINE and arm not in _PUBLISHED_ARMS:
             return None
         switches.append("off" if arm == BASELINE else "on")
-    if training_noise != testing_noise:
-        table = "2" if training_noise == "none" else ""
+    known = facts(algorithm)
+    if training_noise == testing_noise and switches[0] == switches[1]:
+        table = known.table
+    elif not known.released:
+        table = ""
+    elif training_noise == testing_noise:
+        table = "5"
     else:
-        table = "1" if switches[0] == switches[1] else "5"
+        table = "2" if training_noise == "none" else ""
     return published_cells().get((table, task, testing_noise, switches[0], switches[1]))

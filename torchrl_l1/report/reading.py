@@ -13,11 +13,13 @@ import numpy as np
 
 from torchrl_l1.experiment.l1_options import controller_label
 from torchrl_l1.experiment.run_directory import RunDirectoryError
+from torchrl_l1.report.algorithms import AlgorithmFacts
 from torchrl_l1.report.numeric_csv import numeric_rows
 
 __all__ = [
     "SIGNALS",
     "Evaluation",
+    "distinct_policies",
     "one_policy",
     "read_evaluations",
     "read_metrics",
@@ -51,6 +53,7 @@ class Evaluation:
         epsilon: tolerance of the switching law that the test has set; ``None`` if it has not.
         alpha: gain of the filter that the test has set; ``None`` if it has not.
         switch_rate: switches per step; NaN if unknown or without L1.
+        stage: whose policy it is, of an algorithm with several stages.
     """
 
     l1: str
@@ -64,11 +67,12 @@ class Evaluation:
     epsilon: float | None = None
     alpha: float | None = None
     switch_rate: float = math.nan
+    stage: str = ""
 
     @property
     def condition(self) -> tuple[Any, ...]:
         """What was tested: equal for repetitions."""
-        return self.controller, self.noise, self.bias, self.gain, self.policy
+        return self.controller, self.noise, self.bias, self.gain, self.policy, self.stage
 
     @property
     def controller(self) -> str:
@@ -81,16 +85,28 @@ class Evaluation:
         return self.epsilon is not None or self.alpha is not None
 
 
-def read_metrics(file: Path) -> dict[str, np.ndarray]:
+def read_metrics(file: Path, stages: int = 0) -> dict[str, np.ndarray]:
     """Columns of a metrics table; empty ones for a run that has only just begun.
 
     Those of :data:`SIGNALS` are NaN where the run has none.
+
+    Args:
+        file: the table.
+        stages: of the algorithm; with any, there is a column ``stage``.
     """
-    rows = _rows(file, _METRICS, optional=SIGNALS) if file.exists() else []
-    columns = {name: np.array([row[name] for row in rows]) for name in (*_METRICS, *SIGNALS)}
+    numbers = (*_METRICS, "stage") if stages else _METRICS
+    rows = _rows(file, numbers, optional=SIGNALS) if file.exists() else []
+    columns = {name: np.array([row[name] for row in rows]) for name in (*numbers, *SIGNALS)}
     if not np.array_equal(columns["iteration"], np.arange(len(rows))):
         raise RunDirectoryError(f"{file}: the iterations are not 0, 1, 2, ... without a gap")
+    if stages and not _in_turn(columns["stage"], stages):
+        raise RunDirectoryError(f"{file}: the stages are not 1 to {stages} in turn")
     return columns
+
+
+def _in_turn(stage: np.ndarray, stages: int) -> bool:
+    found = list(dict.fromkeys(stage.tolist()))
+    return found == list(range(1, stages + 1))[: len(found)] and bool((np.diff(stage) >= 0).all())
 
 
 def read_seconds(file: Path, iterations: int, phases: Sequence[str]) -> dict[str, np.ndarray]:
@@ -111,9 +127,9 @@ def read_evaluations(file: Path) -> list[Evaluation]:
             row["l1"], row["noise"], row["bias"], row["gain"], row["policy"],
             row["return_mean"], int(row["episodes"]),
             None if math.isnan(row["own_l1"]) else bool(row["own_l1"]),
-            _known(row["epsilon"]), _known(row["alpha"]), row[_SWITCH_RATE],
+            _known(row["epsilon"]), _known(row["alpha"]), row[_SWITCH_RATE], row["stage"],
         )
-        for row in _rows(file, _NUMBERS, ("l1", "noise", "policy"), optional)
+        for row in _rows(file, _NUMBERS, ("l1", "noise", "policy"), optional, ("stage",))
     ]  # fmt: skip
 
 
@@ -127,15 +143,27 @@ def one_policy(tests: Sequence[Evaluation]) -> list[Evaluation]:
     return list(chosen.values())
 
 
+def distinct_policies(tests: Sequence[Evaluation], algorithm: AlgorithmFacts) -> list[Evaluation]:
+    """The tests, each once where an algorithm acts in one way only, in all stages or in some."""
+    if not algorithm.samples:
+        return one_policy(tests)
+    planned = [test for test in tests if algorithm.plans(test.stage)]
+    return [*one_policy(planned), *(test for test in tests if not algorithm.plans(test.stage))]
+
+
 def _known(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
 def _rows(
-    file: Path, numbers: Sequence[str], words: Sequence[str] = (), optional: Sequence[str] = ()
+    file: Path,
+    numbers: Sequence[str],
+    words: Sequence[str] = (),
+    optional: Sequence[str] = (),
+    optional_words: Sequence[str] = (),
 ) -> list[dict[str, Any]]:
     try:
-        return numeric_rows(file, numbers, words, optional)
+        return numeric_rows(file, numbers, words, optional, optional_words)
     except ValueError as error:
         raise RunDirectoryError(f"{error}. Move the run directory away, or run it again") from error
 

@@ -15,6 +15,7 @@ __all__ = [
     "algorithm_table",
     "evaluation_table",
     "paired_table",
+    "stage_table",
     "training_table",
     "tuning_table",
 ]
@@ -67,6 +68,29 @@ def paired_table(rows: Sequence[Row]) -> str:
     return markdown(lines)
 
 
+def stage_table(rows: Sequence[Row]) -> str:
+    """The return at the end of each stage, a column per L1 setting."""
+    arms = list(dict.fromkeys(row["l1"] for row in rows))
+    lines = []
+    keys = ("task", "noise", "variant", "stage", "policy")
+    for cell, found in _grouped(rows, keys, "l1"):
+        on = [arm for arm in arms if arm != BASELINE]
+        line = dict(zip(keys, cell, strict=True))
+        line |= {
+            "real steps": ", ".join(dict.fromkeys(str(row["real_steps"]) for row in found.values()))
+        }
+        line |= {f"L1 {arm}": _with_interval(found.get(arm)) for arm in arms}
+        line |= {f"L1 {arm} less off": _less_off(found.get(arm, {})) for arm in on}
+        line["seeds"] = ", ".join(dict.fromkeys(str(row["seeds"]) for row in found.values()))
+        line["switches per 1000 steps"] = ", ".join(
+            number(found[arm]["switches_per_1000"])
+            for arm in on
+            if "switches_per_1000" in found.get(arm, {})
+        )
+        lines.append(line)
+    return markdown(lines)
+
+
 def algorithm_table(rows: Sequence[Row]) -> str:
     """The algorithms with each L1 setting, task by task."""
     lines = [
@@ -110,15 +134,16 @@ def evaluation_table(rows: Sequence[Row]) -> str:
     """
     notes = Footnotes()
     tested = list(dict.fromkeys(row["l1"] for row in rows))
-    keys = ("task", "training_noise", "variant", "noise", "bias", "gain")
+    keys = ("task", "training_noise", "variant", "stage", "noise", "bias", "gain")
     lines = []
     for cell, found in _grouped(rows, keys, "l1"):
-        task, training_noise, variant, noise, bias, gain = cell
+        task, training_noise, variant, stage, noise, bias, gain = cell
         first = next(iter(found.values()))
         line = {
             "task": task,
             "training noise": "" if training_noise == "none" else training_noise,
             "variant": variant,
+            "stage": stage,
             "noise": noise,
             "bias": "" if bias == 0 else f"{bias:g}",
             "gain": "" if gain == 1 else f"{gain:g}",
@@ -144,6 +169,7 @@ def tuning_table(rows: Sequence[Row]) -> str:
             "task": row["task"],
             "training noise": "" if row["training_noise"] == "none" else row["training_noise"],
             "variant": row["variant"],
+            "stage": row.get("stage", ""),
             "noise": row["noise"],
             "bias": "" if row["bias"] == 0 else f"{row['bias']:g}",
             "gain": "" if row["gain"] == 1 else f"{row['gain']:g}",
@@ -168,8 +194,9 @@ def ablation_table(rows: Sequence[Row]) -> str:
     """
     notes = Footnotes()
     lines = []
-    for (task, noise, variant), found in _grouped(rows, ("task", "noise", "variant"), "phase"):
-        line = {"task": task, "noise": noise, "variant": variant}
+    keys = ("task", "noise", "variant", "stage")
+    for cell, found in _grouped(rows, keys, "phase"):
+        line = dict(zip(keys, cell, strict=True))
         line |= {phase: _with_interval(found.get(phase)) for phase in PHASES}
         line["training seeds"] = ", ".join(
             sorted({str(row["training_seeds"]) for row in found.values()})
@@ -184,14 +211,15 @@ def _grouped(
 ) -> list[tuple[tuple[Any, ...], dict[str, Row]]]:
     groups: dict[tuple[Any, ...], dict[str, Row]] = {}
     for row in rows:
-        groups.setdefault(tuple(row[key] for key in keys), {})[row[inner]] = row
+        groups.setdefault(tuple(row.get(key, "") for key in keys), {})[row[inner]] = row
     return list(groups.items())
 
 
 def _with_interval(row: Row | None) -> str:
     if row is None:
         return "–"
-    spread = _spread(row["return_mean"], row["std"] if row["training_seeds"] > 1 else None)
+    seeds = row["seeds"] if "seeds" in row else row["training_seeds"]
+    spread = _spread(row["return_mean"], row["std"] if seeds > 1 else None)
     return f"{spread} {_interval(row, 'return')}".removesuffix(" –")
 
 

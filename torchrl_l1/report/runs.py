@@ -33,6 +33,8 @@ class Run:
             if unknown.
         versions: what it ran with.
         evaluations: by name of the evaluation.
+        stage: number ``(T,)`` of the stage that each outer iteration belongs to, from 1; ``None``
+            where the algorithm has one only.
     """
 
     path: Path
@@ -44,6 +46,7 @@ class Run:
     seconds: Mapping[str, np.ndarray]
     versions: dict[str, str] = field(default_factory=dict)
     evaluations: dict[str, list[Evaluation]] = field(default_factory=dict)
+    stage: np.ndarray | None = None
 
     @property
     def finished(self) -> bool:
@@ -68,6 +71,16 @@ class Run:
     def final_signal(self, name: str) -> float:
         """Mean of a signal of L1 over the last three outer iterations; NaN without L1."""
         return float(final_return(self.signals[name]))
+
+    def during(self, position: int) -> np.ndarray:
+        """Which outer iterations ``(T,)`` belong to a stage, the first being 0."""
+        if self.stage is None:
+            return np.full(len(self.returns), position == 0)
+        return self.stage == position + 1
+
+    def end_of(self, position: int, window: int) -> np.ndarray:
+        """Indices of the last outer iterations of a stage, at most ``window`` of them."""
+        return np.flatnonzero(self.during(position))[-window:]
 
     @property
     def training_seconds(self) -> np.ndarray:

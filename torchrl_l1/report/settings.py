@@ -73,7 +73,7 @@ class Identity:
     def as_published(self) -> bool:
         """Whether the published tables are of such runs: algorithm, model and controller."""
         affine = self.model_form == "affine"
-        return facts(self.algorithm).published and not affine and not self.departures
+        return bool(facts(self.algorithm).table) and not affine and not self.departures
 
 
 def identify(config: Mapping[str, Any]) -> Identity:

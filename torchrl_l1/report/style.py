@@ -36,7 +36,7 @@ __all__ = [
 # Okabe and Ito: told apart with any colour vision. Grey is kept for the authors' curves.
 _ARMS = {"off": "#D55E00", "paper": "#0072B2", "reference": "#009E73", "slow": "#CC79A7"}
 # Not those of the arms, which vary within an algorithm.
-_ALGORITHMS = {"metrpo": "#000000", "pets": "#CC79A7", "dets": "#009E73"}
+_ALGORITHMS = {"metrpo": "#000000", "mbmf": "#E69F00", "pets": "#CC79A7", "dets": "#009E73"}
 _CYCLE = ("#D55E00", "#0072B2", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#000000")
 
 _NOISES = {
@@ -71,7 +71,7 @@ def arm_style(arm: str, arms: Sequence[str]) -> Any:
 
 def algorithm_color(algorithm: str) -> str:
     """Colour of an algorithm."""
-    return _ALGORITHMS.get(algorithm, "#E69F00")
+    return _ALGORITHMS.get(algorithm, "#56B4E9")
 
 
 def algorithm_label(name: str, arm: str) -> str:

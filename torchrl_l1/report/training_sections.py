@@ -6,6 +6,7 @@ from torchrl_l1.report.learning_curves import plot_comparison, plot_task
 from torchrl_l1.report.page import Page
 from torchrl_l1.report.reference_curves import ReferenceCurves
 from torchrl_l1.report.rendering import paired_table, training_table
+from torchrl_l1.report.stage_sections import stage_sections
 from torchrl_l1.report.style import title
 from torchrl_l1.report.time_tables import time_rows, time_table
 from torchrl_l1.report.training_tables import paired_rows, training_row
@@ -20,13 +21,14 @@ def training_sections(page: Page, study: Study, reference: ReferenceCurves | Non
     Args:
         page: where to.
         study: the runs.
-        reference: published curves; left out where they are of another algorithm.
+        reference: curves of the authors' logs; left out where they are of another algorithm.
     """
-    if not study.facts.published:
+    if not study.facts.released:
         reference = None
     _training(page, study, reference)
     _pairs(page, study)
     _curves(page, study, reference)
+    stage_sections(page, study)
     _comparisons(page, study, reference)
     _time(page, study)
 
@@ -39,12 +41,20 @@ def _training(page: Page, study: Study, reference: ReferenceCurves | None) -> No
         + ", of sampled actions as in the paper" * study.facts.samples
         + "; the spread is the paper's ± (standard deviation over "
         "seeds in each of these iterations, averaged), the interval that of the mean over seeds. "
-        "What L1 did (switches, mean norm of its input, share of actions that a bound cut) are "
-        "means over the same iterations.",
+        + _l1_did(study),
     )
     page.text(training_table([row for cell, row in rows.items() if not cell.variant]))
     page.text(_main_settings(study))
     page.csv("training", list(rows.values()))
+
+
+def _l1_did(study: Study) -> str:
+    if study.facts.stages:
+        return f"L1 acts in {study.facts.stages[0].words} only; what it did is under Stages."
+    return (
+        "What L1 did (switches, mean norm of its input, share of actions that a bound cut) are "
+        "means over the same iterations."
+    )
 
 
 def _main_settings(study: Study) -> str:
@@ -87,13 +97,21 @@ def _curves(page: Page, study: Study, reference: ReferenceCurves | None) -> None
         "Thin: single seeds; bold: their mean"
         + "; dashed: mean of the return with the mean action" * study.facts.samples
         + "; grey: mean of the authors' logs, where they were given, cut where ours end"
-        * study.facts.published
+        * study.facts.released
+        + _bands(study)
         + ".",
     )
     for task in study.tasks():
         file = page.file("learning_curves", task)
         figure = plot_task(study, task, file, reference, page.name)
         page.figure(figure, f"Learning curves, {title(task)}")
+
+
+def _bands(study: Study) -> str:
+    words = [stage.words for stage in study.facts.stages]
+    if not words:
+        return ""
+    return f"; shaded: the stages before {words[-1]}, {' and '.join(words[:-1])}"
 
 
 def _comparisons(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
@@ -104,7 +122,7 @@ def _comparisons(page: Page, study: Study, reference: ReferenceCurves | None) ->
             "The same table for runs that depart from the main ones in these settings, and the "
             "main ones of the same task and noise."
             + " It is the comparison of the paper's Figure 2."
-            * ("model.form" in keys and study.facts.published),
+            * ("model.form" in keys and study.facts.released),
         )
         rows = [
             training_row(cell, study.cells[cell], reference)

@@ -21,14 +21,22 @@ from torchrl_l1.report.statistics import (
 )
 from torchrl_l1.report.variants import Cell, Study, variant_text
 
-__all__ = ["paired_rows", "run_rows", "training_row"]
+__all__ = [
+    "difference_summary",
+    "mean_summary",
+    "paired_rows",
+    "place_columns",
+    "run_rows",
+    "training_row",
+    "with_baselines",
+]
 
 
 def run_rows(study: Study) -> list[dict[str, Any]]:
     """One row per run, unfinished ones included."""
     return [
         {
-            **_place(cell),
+            **place_columns(cell),
             "seed": run.identity.seed,
             "iterations": len(run.returns),
             "of": run.identity.outer_iterations,
@@ -52,13 +60,13 @@ def training_row(
     """
     done = [run for run in runs if run.finished]
     place = (cell.task, cell.noise, cell.arm)
-    row: dict[str, Any] = {**_place(cell), "seeds": len(done)}
+    row: dict[str, Any] = {**place_columns(cell), "seeds": len(done)}
     if done:
-        row |= _summary("return", [run.final for run in done])
+        row |= mean_summary("return", [run.final for run in done])
         if len(done) > 1:
             row["published_spread"] = published_spread(np.array([run.returns for run in done]))
         if facts(runs[0].identity.algorithm).samples:
-            row |= _summary("deterministic", [run.final_deterministic for run in done])
+            row |= mean_summary("deterministic", [run.final_deterministic for run in done])
         row["real_steps"] = round(float(np.mean([run.real_steps[-1] for run in done])))
         row |= _signals(done)
     row["unfinished"] = "; ".join(
@@ -67,7 +75,9 @@ def training_row(
     what = runs[0].identity
     affine = what.model_form == "affine"
     # The paper prints no returns with control-affine models; their curves are in its Figure 2.
-    published = published_cell(*place, *place[1:]) if what.as_published else None
+    published = None
+    if what.as_published:
+        published = published_cell(*place, *place[1:], what.algorithm)
     if published is not None:
         row |= published.columns()
     curves = None
@@ -93,13 +103,7 @@ def paired_rows(study: Study) -> list[dict[str, Any]]:
     for cell, runs in study.cells.items():
         if cell.arm == BASELINE:
             continue
-        pairs, single = [], []
-        for run in runs:
-            baseline = study.baseline_of(run)
-            if run.finished and baseline is not None and baseline.finished:
-                pairs.append((run, baseline))
-            else:
-                single.append(str(run.identity.seed))
+        pairs, single = with_baselines(study, runs)
         for policy in study.facts.policies:
             finals = [
                 (l1.final, off.final)
@@ -110,7 +114,7 @@ def paired_rows(study: Study) -> list[dict[str, Any]]:
             differences = [ours - base for ours, base in finals]
             rows.append(
                 {
-                    **_place(cell),
+                    **place_columns(cell),
                     **({"policy": policy} if study.facts.samples else {}),
                     "pairs": len(pairs),
                     "seeds": " ".join(str(run.identity.seed) for run, _ in pairs),
@@ -121,11 +125,23 @@ def paired_rows(study: Study) -> list[dict[str, Any]]:
     return rows
 
 
+def with_baselines(study: Study, runs: Sequence[Run]) -> tuple[list[tuple[Run, Run]], list[str]]:
+    """Each finished run with its finished baseline, and the seeds of the others."""
+    pairs, single = [], []
+    for run in runs:
+        baseline = study.baseline_of(run)
+        if run.finished and baseline is not None and baseline.finished:
+            pairs.append((run, baseline))
+        else:
+            single.append(str(run.identity.seed))
+    return pairs, single
+
+
 def difference_summary(differences: Sequence[float]) -> dict[str, Any]:
     """Mean and, of five or more, interquartile mean, with intervals; and the differences."""
     if not differences:
         return {}
-    result = _summary("difference", differences)
+    result = mean_summary("difference", differences)
     interval = interquartile_interval(differences)
     if interval is not None:
         result["iqm"] = float(interquartile_mean(differences))
@@ -134,7 +150,7 @@ def difference_summary(differences: Sequence[float]) -> dict[str, Any]:
     return result
 
 
-def _summary(name: str, values: Sequence[float]) -> dict[str, Any]:
+def mean_summary(name: str, values: Sequence[float]) -> dict[str, Any]:
     """Mean and, of three values or more, its interval."""
     result = {f"{name}_mean": float(np.mean(values))}
     interval = mean_interval(values)
@@ -161,7 +177,8 @@ def _deterministic(run: Run, study: Study) -> dict[str, float | None]:
     return {"return_deterministic": run.final_deterministic if run.finished else None}
 
 
-def _place(cell: Cell) -> dict[str, Any]:
+def place_columns(cell: Cell) -> dict[str, Any]:
+    """Where a cell is, as the first columns of a table."""
     return {
         "task": cell.task,
         "noise": cell.noise,

@@ -1,0 +1,108 @@
+"""Campaigns of an algorithm with several stages."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from torchrl_l1.campaign.description import read_campaign
+from torchrl_l1.campaign.evaluation import evaluate_run, is_evaluated
+from torchrl_l1.campaign.plan import plan
+from torchrl_l1.campaign.runs import PlannedRun
+from torchrl_l1.campaign.settings import CampaignError, EvaluationSettings
+from torchrl_l1.campaign.yaml_file import dump_yaml, load_yaml
+from torchrl_l1.cli import main
+from torchrl_l1.experiment.launch import compose
+from torchrl_l1.experiment.run import run
+from torchrl_l1.experiment.run_directory import RunDirectory
+
+TINY = [
+    *("outer_iterations=4", "shooting_iterations=1", "cloning.iterations=2", "horizon=8"),
+    *("random_episodes=3", "shooting_episodes=2", "evaluation_episodes=2", "tuning.episodes=3"),
+    *("shooting.horizon=3", "shooting.candidates=8", "model.hidden=[8]", "hidden=[8]"),
+    *("tuning.value_hidden=[8]", "tuning.minibatches=2", "fit.max_epochs=2", "fit.batch_size=8"),
+    *("fit.validation_fraction=0.3", "cloning.max_epochs=2", "cloning.episodes=2"),
+    "wandb.mode=disabled",
+]
+
+
+def campaign_file(folder: Path, **evaluation: object) -> Path:
+    file = folder / "stages.yaml"
+    runs = {"recipe": "mbmf/inverted_pendulum", "overrides": TINY, "matrix": {"l1": ["off"]}}
+    settings = {"name": "frozen", "policy": ["stochastic"], "episodes": 2} | evaluation
+    file.write_text(dump_yaml({"runs": [runs], "evaluations": [settings]}))
+    return file
+
+
+def test_stages_are_evaluated_where_the_campaign_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = campaign_file(tmp_path, stage=["shooting", "tuning"], bias=[0.0, 1.0])
+    arguments = ["campaign", str(file), "--output", str(tmp_path / "out"), "--workers", "1"]
+    main(arguments)
+    (this,) = plan(read_campaign(str(file)), tmp_path / "out")
+    with (this.directory.path / "evaluations/frozen.csv").open() as handle:
+        rows = list(csv.DictReader(handle))
+    assert [(row["stage"], row["l1"], float(row["bias"])) for row in rows] == [
+        (stage, l1, bias)
+        for stage in ("shooting", "tuning")
+        for bias in (0.0, 1.0)
+        for l1 in ("off", "paper")
+    ]
+    described = load_yaml(this.directory.path / "evaluations/frozen.yaml")
+    assert described["stage"] == ["shooting", "tuning"]
+    assert "after 80 real steps" in capsys.readouterr().out
+    assert is_evaluated(this.directory, this.evaluations[0])
+    assert not is_evaluated(this.directory, replace(this.evaluations[0], stage=["shooting"]))
+
+
+def test_table_that_is_older_than_stages_is_of_the_last_one(tmp_path: Path) -> None:
+    directory = RunDirectory(tmp_path)
+    table = tmp_path / "evaluations/e.csv"
+    table.parent.mkdir()
+    table.write_text("l1\n")
+    settings = EvaluationSettings("e")
+    described = {key: value for key, value in settings.of_a_run().items() if key != "stage"}
+    table.with_suffix(".yaml").write_text(dump_yaml({**described, "iterations": 0}))
+    assert is_evaluated(directory, settings)
+    assert not is_evaluated(directory, EvaluationSettings("e", stage=["shooting"]))
+
+
+def test_stage_that_a_run_has_not_changes_nothing(tmp_path: Path) -> None:
+    overrides = [*TINY, "outer_iterations=1", f"run_dir={tmp_path}"]
+    directory = run(compose("mbmf/inverted_pendulum", overrides))
+    settings = EvaluationSettings("e", policy=["stochastic"], episodes=1).of_a_run()
+    before = evaluate_run(str(directory), "e", json.loads(json.dumps(settings))).read_bytes()
+    with pytest.raises(ValueError, match="no stage 'tuning', or not yet; there is shooting"):
+        evaluate_run(str(directory), "e", {**settings, "stage": ["shooting", "tuning"]})
+    assert (directory / "evaluations/e.csv").read_bytes() == before
+    assert (directory / "evaluations/e.yaml").exists()
+
+
+def test_unknown_stage_is_refused_before_anything_starts(tmp_path: Path) -> None:
+    file = campaign_file(tmp_path, stage=["shooting", "fine"])
+    with pytest.raises(CampaignError, match=r"'fine'; the stages .* shooting, cloning, tuning"):
+        plan(read_campaign(str(file)), tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("shooting", "cloning", "tuning", "visits", "practice"), [(3, 2, 4, 5, 7), (1, 1, 0, 1, 1)]
+)
+def test_steps_are_those_that_the_algorithm_counts(
+    shooting: int, cloning: int, tuning: int, visits: int, practice: int
+) -> None:
+    overrides = {"shooting_iterations": shooting, "outer_iterations": shooting + cloning + tuning}
+    config = OmegaConf.merge(
+        compose("mbmf/inverted_pendulum", [*TINY, "run_dir=unused"]),
+        {**overrides, "cloning": {"iterations": cloning, "episodes": visits}},
+        {"tuning": {"episodes": practice}},
+    )
+    algorithm = OmegaConf.to_object(config).build()
+    planned = PlannedRun({}, 0, 0, RunDirectory("unused"), config)
+    steps = [planned.collected_steps(i) for i in range(planned.iterations + 1)]
+    assert steps == [algorithm.real_steps(i) - algorithm.real_steps(0) for i in range(len(steps))]
