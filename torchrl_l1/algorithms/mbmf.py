@@ -115,13 +115,12 @@ class MBMF:
         self.practice = short(policy=explorer, episodes=config.tuning.episodes, l1=None)
         self.policy_evaluation = measured(policy=explorer)
 
-        shot = config.shooting_iterations * self.shooting.frames
-        visited = (config.cloning.iterations - 1) * self.visits.frames
-        self.learning = ModelLearning(
-            self.dynamics, config.fit, config.label, self.start.frames + shot + visited
-        )
+        rounds = config.shooting_iterations + config.cloning.iterations
+        collected = config.collected_episodes(rounds) * steps
+        capacity = self.start.frames + collected
+        self.learning = ModelLearning(self.dynamics, config.fit, config.label, capacity)
         half = (self.task.action_high - self.task.action_low) / 2
-        self.cloning = Cloning(self.clone, config.cloning, half, shot + visited)
+        self.cloning = Cloning(self.clone, config.cloning, half, collected)
         self.iteration = 0
 
     def iterate(self) -> Iterator[IterationResult]:
@@ -134,7 +133,8 @@ class MBMF:
             metrics = rounds[name](number)
             head = {
                 "iteration": self.iteration,
-                "real_steps": self.real_steps(self.iteration + 1),
+                "real_steps": self.start.frames
+                + self.config.collected_episodes(self.iteration + 1) * self.shooting.horizon,
                 "stage": STAGES.index(name) + 1,
             }
             self.iteration += 1
@@ -148,19 +148,6 @@ class MBMF:
         if iteration < shooting + cloning:
             return "cloning", iteration - shooting
         return "tuning", iteration - shooting - cloning
-
-    def real_steps(self, iterations: int) -> int:
-        """Real steps, random ones included, of so many outer iterations."""
-        shooting, cloning = self.config.shooting_iterations, self.config.cloning.iterations
-        shot = min(iterations, shooting)
-        visited = min(max(iterations - shooting - 1, 0), cloning - 1)
-        tuned = max(iterations - shooting - cloning, 0)
-        return (
-            self.start.frames
-            + shot * self.shooting.frames
-            + visited * self.visits.frames
-            + tuned * self.practice.frames
-        )
 
     def _shoot(self, number: int) -> dict[str, float]:
         """Stage 1: fit the model, let the planner act, with L1 around it if it is on."""

@@ -210,6 +210,17 @@ class MBMFConfig:
             check_positive("action_bound", self.action_bound)
         check_plans(self, "shooting", self.shooting.horizon)
 
+    def collected_episodes(self, iterations: int) -> int:
+        """Real episodes of so many outer iterations; random data do not count."""
+        shot = min(iterations, self.shooting_iterations)
+        cloned = min(iterations - shot, self.cloning.iterations)
+        # The first round of cloning learns from what has been collected already.
+        return (
+            shot * self.shooting_episodes
+            + max(cloned - 1, 0) * self.cloning.episodes
+            + (iterations - shot - cloned) * self.tuning.episodes
+        )
+
 
 def check_counts(prefix: str, settings: object, *names: str) -> None:
     """Refuse counts below one, with a ``ValueError``."""

@@ -125,6 +125,10 @@ class METRPOConfig:
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
 
+    def collected_episodes(self, iterations: int) -> int:
+        """Real episodes of so many outer iterations; random data do not count."""
+        return iterations * self.episodes_per_iteration
+
 
 def check_clipping(clip_actions: bool, with_l1: bool) -> None:
     """Refuse unclipped actions where L1 acts.

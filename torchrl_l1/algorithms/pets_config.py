@@ -81,3 +81,7 @@ class PETSConfig:
         check_steps("episode_steps", self.episode_steps)
         check_steps("random_steps", self.random_steps)
         check_plans(self, "cem", self.cem.horizon)
+
+    def collected_episodes(self, iterations: int) -> int:
+        """Real episodes of so many outer iterations; random data do not count."""
+        return iterations * self.episodes_per_iteration

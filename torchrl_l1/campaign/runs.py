@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl_l1.campaign.settings import EvaluationSettings
 from torchrl_l1.envs import get_task
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
+from torchrl_l1.experiment.settings import RunSettings
 
 
 @dataclass
@@ -45,9 +47,15 @@ class PlannedRun:
 
     def collected_steps(self, iterations: int) -> int:
         """Real steps that so many outer iterations collect; random data do not count."""
-        config = self.config
-        full = config.horizon or get_task(config.task).horizon
-        return _episodes(config, iterations) * min(config.episode_steps or full, full)
+        full = self.config.horizon or get_task(self.config.task).horizon
+        steps = min(self.config.episode_steps or full, full)
+        return self._recipe.collected_episodes(iterations) * int(steps)
+
+    @cached_property
+    def _recipe(self) -> RunSettings:
+        recipe = OmegaConf.to_object(self.config)
+        assert isinstance(recipe, RunSettings)
+        return recipe
 
     def iterations_done(self) -> int:
         """Outer iterations so far; all of them only once the run is sure to be finished."""
@@ -87,19 +95,6 @@ class PlannedRun:
         except RunDirectoryError as error:
             return str(error)
         return None
-
-
-def _episodes(config: DictConfig, iterations: int) -> int:
-    if config.algorithm != "mbmf":
-        return int(iterations * config.episodes_per_iteration)
-    shot = min(iterations, config.shooting_iterations)
-    cloned = min(iterations - shot, config.cloning.iterations)
-    # The first round of cloning learns from what has been collected already.
-    return int(
-        shot * config.shooting_episodes
-        + max(cloned - 1, 0) * config.cloning.episodes
-        + (iterations - shot - cloned) * config.tuning.episodes
-    )
 
 
 def recipe_name(recipe: str) -> str:

@@ -118,6 +118,10 @@ class RunSettings(ABC):
             raise ValueError(f"horizon must be at least 1 or null, got {self.horizon}")
 
     @abstractmethod
+    def collected_episodes(self, iterations: int) -> int:
+        """Real episodes of so many outer iterations; random data do not count."""
+
+    @abstractmethod
     def build(self) -> Algorithm:
         """The algorithm that the recipe describes, fresh.
 
