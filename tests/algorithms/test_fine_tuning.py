@@ -110,6 +110,17 @@ def test_each_network_learns_in_its_own_passes() -> None:
     assert not torch.equal(tuning.value.network[0].weight, same.value.network[0].weight)
 
 
+def test_rewards_that_are_not_finite_change_nothing() -> None:
+    policy, tuning = make()
+    before = [parameter.clone() for parameter in policy.parameters()]
+    data = episodes(policy, 1.0)
+    data["next", "reward"][3] = torch.nan
+    with pytest.raises(ValueError, match="non-finite advantages"):
+        tuning.step(data)
+    pairs = zip(before, policy.parameters(), strict=True)
+    assert all(torch.equal(kept, parameter) for kept, parameter in pairs)
+
+
 def test_resumed_rounds_repeat_the_unbroken_ones() -> None:
     policy, tuning = make()
     tuning.step(episodes(policy, 1.0))

@@ -105,7 +105,7 @@ def test_steps_are_those_that_the_algorithm_counts(
     algorithm = OmegaConf.to_object(config).build()
     planned = PlannedRun({}, 0, 0, RunDirectory("unused"), config)
     counted = [result.metrics["real_steps"] for result in algorithm.iterate()]
-    random = algorithm.start.frames
+    random = algorithm.real.start.frames
     assert [planned.collected_steps(i) for i in range(planned.iterations + 1)] == [
         count - random for count in (random, *counted)
     ]

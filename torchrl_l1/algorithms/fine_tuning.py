@@ -84,6 +84,9 @@ class FineTuning:
         Args:
             data: the episodes; values and advantages are written to them.
             progress: share of the annealing that is over, from 0 to 1.
+
+        Raises:
+            ValueError: if advantages are not finite; nothing has been learned from them then.
         """
         config = self.config
         rates = (config.learning_rate, config.value_learning_rate)
@@ -91,6 +94,8 @@ class FineTuning:
             optimizer.param_groups[0]["lr"] = rate * (1 - progress)
         with torch.no_grad():
             self.advantage(data)
+        if not torch.isfinite(data["advantage"]).all():
+            raise ValueError("PPO: non-finite advantages; check rewards and value estimates")
         keys = ("observation", _SAMPLED, _LOG_PROB, "advantage", "value_target")
         samples = data.select(*keys).reshape(-1)
         reports: list[TensorDictBase] = []

@@ -22,19 +22,19 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl_l1.algorithms.algorithm import IterationResult
 from torchrl_l1.algorithms.cloning import Cloning
 from torchrl_l1.algorithms.collection import (
-    Collection,
     Perturbation,
     episode_returns,
     return_metrics,
     signal_metrics,
 )
 from torchrl_l1.algorithms.device import resolve_device
-from torchrl_l1.algorithms.fine_tuning import FineTuning, exploring
+from torchrl_l1.algorithms.fine_tuning import FineTuning
 from torchrl_l1.algorithms.mbmf_config import MBMFConfig
+from torchrl_l1.algorithms.mbmf_environments import StageEnvironments
 from torchrl_l1.algorithms.mbmf_metrics import STAGES, cloning_metrics, tuning_metrics
 from torchrl_l1.algorithms.metrics import fit_metrics
 from torchrl_l1.algorithms.model_learning import ModelLearning
-from torchrl_l1.algorithms.policy import GaussianPolicy, acting
+from torchrl_l1.algorithms.policy import GaussianPolicy
 from torchrl_l1.algorithms.seeding import seed_streams
 from torchrl_l1.control import L1Config
 from torchrl_l1.control.compilation import CompileMode
@@ -90,34 +90,22 @@ class MBMF:
         self.clone, self.policy = deepcopy(self.initial), deepcopy(self.initial)
         self.tuning = FineTuning(self.policy, config.tuning)
 
-        real = partial(
-            Collection,
+        self.real = StageEnvironments(
             self.task,
-            dynamics=self.acting_dynamics,
-            perturbation=perturbation or Perturbation(),
+            config,
+            self.acting_dynamics,
+            self.planner,
+            self.clone if config.cloning.states == "current" else self.initial,
+            self.clone,
+            self.policy,
+            l1,
+            perturbation or Perturbation(),
+            horizon,
+            compile_l1,
         )
-        full = horizon or self.task.horizon
-        steps = min(config.episode_steps or full, full)
-        short = partial(real, horizon=steps)
-        measured = partial(real, episodes=config.evaluation_episodes, horizon=full, l1=None)
-        planned = partial(real, policy=self.planner, l1=l1, compile_l1=compile_l1)
-        self.start = planned(
-            episodes=config.random_episodes, horizon=min(config.random_steps or steps, full)
-        )
-        self.shooting = planned(episodes=config.shooting_episodes, horizon=steps)
-        self.shooting_evaluation = planned(episodes=config.shooting_episodes, horizon=full)
-        visiting = self.clone if config.cloning.states == "current" else self.initial
-        self.visits = short(
-            policy=acting(visiting, self.task), episodes=config.cloning.episodes, l1=None
-        )
-        self.clone_evaluation = measured(policy=acting(self.clone, self.task))
-        explorer = exploring(self.policy, self.task)
-        self.practice = short(policy=explorer, episodes=config.tuning.episodes, l1=None)
-        self.policy_evaluation = measured(policy=explorer)
-
         rounds = config.shooting_iterations + config.cloning.iterations
-        collected = config.collected_episodes(rounds) * steps
-        capacity = self.start.frames + collected
+        collected = config.collected_episodes(rounds) * self.real.shooting.horizon
+        capacity = self.real.start.frames + collected
         self.learning = ModelLearning(self.dynamics, config.fit, config.label, capacity)
         half = (self.task.action_high - self.task.action_low) / 2
         self.cloning = Cloning(self.clone, config.cloning, half, collected)
@@ -133,8 +121,8 @@ class MBMF:
             metrics = rounds[name](number)
             head = {
                 "iteration": self.iteration,
-                "real_steps": self.start.frames
-                + self.config.collected_episodes(self.iteration + 1) * self.shooting.horizon,
+                "real_steps": self.real.start.frames
+                + self.config.collected_episodes(self.iteration + 1) * self.real.shooting.horizon,
                 "stage": STAGES.index(name) + 1,
             }
             self.iteration += 1
@@ -153,16 +141,16 @@ class MBMF:
         """Stage 1: fit the model, let the planner act, with L1 around it if it is on."""
         if number == 0:
             with self._phase("random", "random data"):
-                self.learning.store(self.start.random(self.seed, self._bounds()))
+                self.learning.store(self.real.start.random(self.seed, self._bounds()))
         fit = self._fit()
         with self._phase("collect", "planning and collecting"):
-            data = self.shooting.collect(self.seed, self.iteration)
+            data = self.real.shooting.collect(self.seed, self.iteration)
             self.learning.store(data)
             self.cloning.store(data["observation"].flatten(0, 1), data["action"].flatten(0, 1))
         full = data
-        if self.shooting.horizon < self.shooting_evaluation.horizon:
+        if self.real.shooting.horizon < self.real.shooting_measured.horizon:
             with self._phase("evaluate", "evaluating"):
-                full = self.shooting_evaluation.evaluate(self.seed, self.iteration)
+                full = self.real.shooting_measured.evaluate(self.seed, self.iteration)
         return {
             **_returns(full, full),
             **signal_metrics(data),
@@ -176,7 +164,7 @@ class MBMF:
         labels = {}
         if number > 0:
             with self._phase("collect", "visiting states and labelling them"):
-                data = self.visits.collect(self.seed, self.iteration)
+                data = self.real.visits.collect(self.seed, self.iteration)
                 self.learning.store(data)
                 states = data["observation"].flatten(0, 1)
                 plans = self.planner.plan(states)
@@ -185,7 +173,7 @@ class MBMF:
         with self._phase("clone", "cloning"):
             report = self.cloning.fit(lambda epoch: self.on_phase(f"cloning, epoch {epoch}"))
         with self._phase("evaluate", "evaluating"):
-            data = self.clone_evaluation.evaluate(self.seed, self.iteration)
+            data = self.real.clone_measured.evaluate(self.seed, self.iteration)
         return {
             **_returns(data, data),
             **signal_metrics(data),
@@ -201,13 +189,13 @@ class MBMF:
             self.policy.load_state_dict(self.clone.state_dict())
             self.policy.reset_std(config.std)
         with self._phase("collect", "collecting"):
-            data = self.practice.collect(self.seed, self.iteration)
-        done = number * self.practice.frames / (config.anneal_steps or math.inf)
+            data = self.real.practice.collect(self.seed, self.iteration)
+        done = number * self.real.practice.frames / (config.anneal_steps or math.inf)
         with self._phase("tune", "PPO"):
             report = self.tuning.step(data, min(done, 1.0))
         with self._phase("evaluate", "evaluating"):
-            evaluate = partial(self.policy_evaluation.evaluate, self.seed, self.iteration)
-            shorter = self.practice.horizon < self.policy_evaluation.horizon
+            evaluate = partial(self.real.policy_measured.evaluate, self.seed, self.iteration)
+            shorter = self.real.practice.horizon < self.real.policy_measured.horizon
             whole = not shorter and not data["next", "terminated"].any()
             sampled = data if whole else evaluate(deterministic=False)
             returns = _returns(sampled, evaluate(deterministic=True))
@@ -257,7 +245,7 @@ class MBMF:
         """What acts in real environments after each stage, those that have begun."""
         rounds = max(self.iteration - 1, 0)
         reached = STAGES.index(self.stage(rounds)[0]) + 1
-        every = (self.shooting, self.clone_evaluation, self.policy_evaluation)
+        every = (self.real.shooting, self.real.clone_measured, self.real.policy_measured)
         return {
             name: collection.policy
             for name, collection in zip(STAGES[:reached], every[:reached], strict=True)
