@@ -141,7 +141,7 @@ def _evaluate_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
         nargs="+",
         default=[],
         help="stages whose policies are tested, of algorithms with several (shooting, cloning, "
-        "tuning); the last that there is by default",
+        "fine_tuning); the last that there is by default",
     )
     add("--episodes", type=int, default=25, help="episodes per cell and run")
     add("--seed", type=int, default=0, help="seed of resets, noise and sampled actions")

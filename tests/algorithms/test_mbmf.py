@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 
 import pytest
 import torch
 
-from torchrl_l1.algorithms import MBMF, CloningConfig, MBMFConfig, ModelConfig, TuningConfig
+from torchrl_l1.algorithms import (
+    MBMF,
+    CloningConfig,
+    FineTuningConfig,
+    MBMFConfig,
+    ModelConfig,
+    Perturbation,
+)
+from torchrl_l1.algorithms.mbmf_config import ClonedPolicyConfig
 from torchrl_l1.algorithms.mbmf_metrics import METRICS
-from torchrl_l1.control import L1Config
+from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.dynamics import FitConfig
+from torchrl_l1.envs.noise import ActionNoise, ObservationNoise
 from torchrl_l1.planning import ShootingConfig
 
 L1 = L1Config(0.04, epsilon=0.2, action_low=-3.0, action_high=3.0)
@@ -24,11 +34,11 @@ def tiny(**changes: object) -> MBMFConfig:
         "shooting_episodes": 2,
         "evaluation_episodes": 3,
         "shooting": ShootingConfig(horizon=4, candidates=16),
-        "hidden": [8],
+        "policy": ClonedPolicyConfig(hidden=[8]),
         "model": ModelConfig(members=1, hidden=[8]),
         "fit": FitConfig(batch_size=16, max_epochs=2),
         "cloning": CloningConfig(iterations=2, episodes=1, max_epochs=3, batch_size=16),
-        "tuning": TuningConfig(episodes=2, epochs=2, value_epochs=3, minibatches=2),
+        "fine_tuning": FineTuningConfig(episodes=2, epochs=2, value_epochs=3, minibatches=2),
     }
     return MBMFConfig(**{**settings, **changes})  # type: ignore[arg-type]
 
@@ -72,7 +82,7 @@ def test_policies_are_those_of_the_stages_so_far() -> None:
     assert list(algorithm.policies) == ["shooting"]
     for _ in algorithm.iterate():
         reached.append(list(algorithm.policies)[-1])
-    assert reached == ["shooting", "shooting", "cloning", "cloning", "tuning", "tuning"]
+    assert reached == ["shooting", "shooting", "cloning", "cloning", "fine_tuning", "fine_tuning"]
 
 
 def test_fine_tuning_starts_from_the_clone_and_leaves_it_alone() -> None:
@@ -80,7 +90,7 @@ def test_fine_tuning_starts_from_the_clone_and_leaves_it_alone() -> None:
     list(algorithm.iterate())
     cloned = {name: value.clone() for name, value in algorithm.clone.state_dict().items()}
     algorithm.config.outer_iterations = 5
-    algorithm.config.tuning.learning_rate = 0.0
+    algorithm.config.fine_tuning.learning_rate = 0.0
     list(algorithm.iterate())
     tuned = algorithm.policy.state_dict()
     assert all(
@@ -88,7 +98,7 @@ def test_fine_tuning_starts_from_the_clone_and_leaves_it_alone() -> None:
     )
     assert tuned["log_std"].exp().item() == pytest.approx(0.5)
     algorithm.config.outer_iterations = 6
-    algorithm.config.tuning.learning_rate = 1e-2
+    algorithm.config.fine_tuning.learning_rate = 1e-2
     list(algorithm.iterate())
     assert all(torch.equal(algorithm.clone.state_dict()[k], v) for k, v in cloned.items())
     assert not torch.equal(algorithm.policy.mean[0].weight, algorithm.clone.mean[0].weight)
@@ -101,36 +111,93 @@ def test_random_and_planned_actions_stay_within_their_bound() -> None:
     assert 0.9 < action.abs().max() <= 1.0
     wide = make(None, outer_iterations=2)
     list(wide.iterate())
-    assert wide.learning.buffer[:]["action"].abs().max() > 1.5
+    action = wide.learning.buffer[:]["action"]
+    assert action[:20].abs().max() > 1.5 and action[20:].abs().max() > 1.5
 
 
 @pytest.mark.parametrize("states", ["current", "initial"])
 def test_the_planner_labels_the_states_of_the_policy_asked_for(states: str) -> None:
     """With the published error, what has been learned never reaches the policy that collects."""
     cloning = CloningConfig(
-        iterations=2, episodes=1, max_epochs=30, learning_rate=0.05, states=states, std=1e-6
+        iterations=3, episodes=1, max_epochs=30, learning_rate=0.05, label_states=states, std=1e-6
     )
-    algorithm = make(None, cloning=cloning, outer_iterations=4)
+    algorithm = make(None, cloning=cloning, outer_iterations=5)
     iterations = algorithm.iterate()
     for _ in range(3):
         next(iterations)
-    learned = algorithm.clone if states == "current" else algorithm.initial
-    expected = [parameter.clone() for parameter in learned.mean.parameters()]
-    normalizer = learned.normalizer.normalize(torch.ones(4))
-    next(iterations)
-    data = algorithm.learning.buffer[:]
-    visited, action = data["observation"][-10:], data["action"][-10:]
-    with torch.no_grad():
-        for parameter, value in zip(learned.mean.parameters(), expected, strict=True):
-            parameter.copy_(value)
-    if states == "initial":
-        assert torch.equal(normalizer, torch.ones(4))
-        mean, _ = learned(visited)
-        torch.testing.assert_close(action, mean.detach().clamp(-3, 3), atol=1e-4, rtol=1e-4)
-    labels = algorithm.cloning.buffer[:]
-    assert torch.equal(labels["observation"][-10:], visited)
-    # They are the planner's, not what the policy did.
-    assert (labels["action"][-10:] - action).abs().mean() > 0.1
+    for _ in range(2):
+        before = deepcopy(algorithm.clone if states == "current" else algorithm.initial)
+        next(iterations)
+        data = algorithm.learning.buffer[:][-10:]
+        mean, _ = before(data["observation"])
+        expected = mean.detach().clamp(-3, 3)
+        torch.testing.assert_close(data["action"], expected, atol=1e-4, rtol=1e-4)
+        labels = algorithm.cloning.buffer[:][-10:]
+        assert torch.equal(labels["observation"], data["observation"])
+        # They are the planner's, not what the policy did.
+        assert (labels["action"] - data["action"]).abs().mean() > 0.1
+
+
+def test_labels_are_drawn_even_where_doing_nothing_is_best() -> None:
+    """No plan is there to go on with; the middle of the bounds must not pass for one."""
+    algorithm = make(None)
+    iterations = algorithm.iterate()
+    for _ in range(4):
+        next(iterations)
+    labels = algorithm.cloning.buffer[:]["action"][-10:]
+    assert (labels != 0).all()
+    upright = torch.zeros(20, 4)
+    assert (algorithm.labeller.plan(upright).actions[:, 0] != 0).all()
+
+
+def test_only_fresh_plans_are_cloned_and_what_was_planned_not_what_acted() -> None:
+    algorithm = make(L1, replan_every=3, outer_iterations=2)
+    list(algorithm.iterate())
+    # 4 of the 10 steps of each of 4 episodes.
+    assert len(algorithm.cloning.buffer) == 16
+    real, cloned = algorithm.learning.buffer[:], algorithm.cloning.buffer[:]
+    last = real[-10:]
+    torch.testing.assert_close(cloned["action"][-4:], last["action"][::3])
+    assert not torch.equal(cloned["action"][-4:], last["executed"][::3])
+
+
+def test_noise_is_in_all_stages_and_l1_around_the_planner_alone() -> None:
+    perturbation = Perturbation(action_noise=0.1, observation_noise=0.2)
+    algorithm = MBMF("inverted_pendulum", tiny(), L1, perturbation, horizon=10)
+    stages = vars(algorithm.real)
+    assert len(stages) == 7
+    for name, collection in stages.items():
+        kinds = {type(transform) for transform in collection.env.transform}
+        assert {ActionNoise, ObservationNoise} <= kinds, name
+        assert (L1Transform in kinds) == (name in ("start", "shooting", "shooting_measured")), name
+
+
+def test_step_size_falls_with_the_real_steps_of_fine_tuning() -> None:
+    settings = FineTuningConfig(
+        episodes=2, epochs=1, value_epochs=1, minibatches=2, anneal_steps=50, learning_rate=1e-3
+    )
+    algorithm = make(None, fine_tuning=settings, outer_iterations=8)
+    rates = []
+    for result in algorithm.iterate():
+        if result.metrics["stage"] == 3:
+            rates.append(algorithm.fine_tuning.optimizers["policy"].param_groups[0]["lr"])
+    assert rates == pytest.approx([1e-3, 0.6e-3, 0.2e-3, 0.0])
+
+
+def test_episodes_that_end_early_go_through_all_stages() -> None:
+    algorithm = MBMF("walker", tiny(), None, horizon=40)
+    results = [result.metrics for result in algorithm.iterate()]
+    assert [metrics["stage"] for metrics in results] == [1, 1, 2, 2, 3, 3]
+    assert all(math.isfinite(value) for metrics in results for value in metrics.values())
+    # Each environment takes as many steps as a full episode has.
+    assert results[-1]["real_steps"] == 40 * (2 + 4 + 1 + 4)
+    assert algorithm.real.practice.collect(0, 9)["next", "terminated"].any()
+
+
+def test_networks_are_saved_once_their_stage_has_begun() -> None:
+    algorithm = make(None)
+    names = [list(algorithm.weights()) for _ in algorithm.iterate()]
+    assert names == [["model"]] * 2 + [["model", "clone"]] * 2 + [["model", "clone", "policy"]] * 2
 
 
 def test_short_episodes_are_measured_on_full_ones() -> None:
@@ -177,7 +244,6 @@ def test_the_clone_acts_as_well_as_the_planner() -> None:
         ({"episode_steps": 0}, "episode_steps"),
         ({"plan_discount": 0.0}, "plan_discount"),
         ({"action_bound": 0.0}, "action_bound"),
-        ({"hidden": [0]}, "hidden"),
     ],
 )
 def test_bad_settings_are_refused(changes: dict[str, object], culprit: str) -> None:
@@ -188,16 +254,17 @@ def test_bad_settings_are_refused(changes: dict[str, object], culprit: str) -> N
 @pytest.mark.parametrize(
     ("settings", "changes", "culprit"),
     [
+        (ClonedPolicyConfig, {"hidden": [0]}, r"policy\.hidden"),
         (CloningConfig, {"iterations": 0}, r"cloning\.iterations"),
         (CloningConfig, {"std": 0.0}, r"cloning\.std"),
-        (CloningConfig, {"states": "all"}, r"cloning\.states"),
+        (CloningConfig, {"label_states": "all"}, r"cloning\.label_states"),
         (CloningConfig, {"validation_fraction": 1.0}, r"cloning\.validation_fraction"),
-        (TuningConfig, {"minibatches": 0}, r"tuning\.minibatches"),
-        (TuningConfig, {"clip": 0.0}, r"tuning\.clip"),
-        (TuningConfig, {"entropy": -1.0}, r"tuning\.entropy"),
-        (TuningConfig, {"discount": 1.5}, r"tuning\.discount"),
-        (TuningConfig, {"anneal_steps": 0}, r"tuning\.anneal_steps"),
-        (TuningConfig, {"value_hidden": [0]}, r"tuning\.value_hidden"),
+        (FineTuningConfig, {"minibatches": 0}, r"fine_tuning\.minibatches"),
+        (FineTuningConfig, {"clip_epsilon": 1.5}, r"fine_tuning\.clip_epsilon"),
+        (FineTuningConfig, {"entropy_coefficient": -1.0}, r"fine_tuning\.entropy"),
+        (FineTuningConfig, {"discount": 1.5}, r"fine_tuning\.discount"),
+        (FineTuningConfig, {"anneal_steps": 0}, r"fine_tuning\.anneal_steps"),
+        (FineTuningConfig, {"value_hidden": [0]}, r"fine_tuning\.value_hidden"),
     ],
 )
 def test_bad_settings_of_a_stage_are_refused(

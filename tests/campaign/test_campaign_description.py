@@ -161,8 +161,8 @@ def test_a_users_recipe_is_found_beside_the_campaign(write: Any, tmp_path: Path)
         (RUNS + "evaluations: [{name: e, alpha: [slow]}]", "alpha must be null, a number or a"),
         (RUNS + "evaluations: [{name: e, alpha: 1.5}]", "alpha must be above 0 and at most 1"),
         (RUNS + "evaluations: [{name: e, stage: policy}]", "stage must be a list"),
-        (RUNS + "evaluations: [{name: e, stage: [tuning]}]",
-         r"\(e\): .* no stage 'tuning'; the stages of its algorithm are policy"),
+        (RUNS + "evaluations: [{name: e, stage: [fine_tuning]}]",
+         r"\(e\): .* no stage 'fine_tuning'; the stages of its algorithm are policy"),
         (RUNS + "evaluations: [{name: e, where: {l1: [slow]}}]", "no run has l1=slow; there are"),
         (RUNS + "evaluations: [{name: e, where: {l2: [off]}}]", "none with a l2"),
         (RUNS + "evaluations: [{name: e}, {name: e, where: {l1: [off]}}]", "another evaluation"),
@@ -227,9 +227,10 @@ def test_campaigns_of_mbmf_make_the_whole_table(tmp_path: Path) -> None:
     assert len({run.directory.path for run in runs}) == len(runs)
     for run in runs:
         frozen = run.values["noise"] == "none" and run.values["l1"] == "off"
-        assert [e.stage for e in run.evaluations] == [["shooting"]] * frozen
         pendulum = run.config.task == "inverted_pendulum"
-        assert all(e.bias == [0.0] + [1.0] * pendulum for e in run.evaluations)
+        stages = ["shooting", "cloning", "fine_tuning"] if pendulum else ["shooting"]
+        assert [e.stage for e in run.evaluations] == [stages] * frozen
+        assert all(len(e.bias) == (4 if pendulum else 1) for e in run.evaluations)
         # 200 000 real steps, as in the paper.
         assert 190_000 < run.collected_steps(run.iterations) < 210_000
 

@@ -23,9 +23,19 @@ from torchrl_l1.experiment.run_directory import RunDirectory
 
 TINY = [
     *("outer_iterations=4", "shooting_iterations=1", "cloning.iterations=2", "horizon=8"),
-    *("random_episodes=3", "shooting_episodes=2", "evaluation_episodes=2", "tuning.episodes=3"),
-    *("shooting.horizon=3", "shooting.candidates=8", "model.hidden=[8]", "hidden=[8]"),
-    *("tuning.value_hidden=[8]", "tuning.minibatches=2", "fit.max_epochs=2", "fit.batch_size=8"),
+    *(
+        "random_episodes=3",
+        "shooting_episodes=2",
+        "evaluation_episodes=2",
+        "fine_tuning.episodes=3",
+    ),
+    *("shooting.horizon=3", "shooting.candidates=8", "model.hidden=[8]", "policy.hidden=[8]"),
+    *(
+        "fine_tuning.value_hidden=[8]",
+        "fine_tuning.minibatches=2",
+        "fit.max_epochs=2",
+        "fit.batch_size=8",
+    ),
     *("fit.validation_fraction=0.3", "cloning.max_epochs=2", "cloning.episodes=2"),
     "wandb.mode=disabled",
 ]
@@ -42,7 +52,7 @@ def campaign_file(folder: Path, **evaluation: object) -> Path:
 def test_stages_are_evaluated_where_the_campaign_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = campaign_file(tmp_path, stage=["shooting", "tuning"], bias=[0.0, 1.0])
+    file = campaign_file(tmp_path, stage=["shooting", "fine_tuning"], bias=[0.0, 1.0])
     arguments = ["campaign", str(file), "--output", str(tmp_path / "out"), "--workers", "1"]
     main(arguments)
     (this,) = plan(read_campaign(str(file)), tmp_path / "out")
@@ -50,12 +60,12 @@ def test_stages_are_evaluated_where_the_campaign_says_so(
         rows = list(csv.DictReader(handle))
     assert [(row["stage"], row["l1"], float(row["bias"])) for row in rows] == [
         (stage, l1, bias)
-        for stage in ("shooting", "tuning")
+        for stage in ("shooting", "fine_tuning")
         for bias in (0.0, 1.0)
         for l1 in ("off", "paper")
     ]
     described = load_yaml(this.directory.path / "evaluations/frozen.yaml")
-    assert described["stage"] == ["shooting", "tuning"]
+    assert described["stage"] == ["shooting", "fine_tuning"]
     assert "after 80 real steps" in capsys.readouterr().out
     assert is_evaluated(this.directory, this.evaluations[0])
     assert not is_evaluated(this.directory, replace(this.evaluations[0], stage=["shooting"]))
@@ -78,29 +88,34 @@ def test_stage_that_a_run_has_not_changes_nothing(tmp_path: Path) -> None:
     directory = run(compose("mbmf/inverted_pendulum", overrides))
     settings = EvaluationSettings("e", policy=["stochastic"], episodes=1).of_a_run()
     before = evaluate_run(str(directory), "e", json.loads(json.dumps(settings))).read_bytes()
-    with pytest.raises(ValueError, match="no stage 'tuning', or not yet; there is shooting"):
-        evaluate_run(str(directory), "e", {**settings, "stage": ["shooting", "tuning"]})
+    with pytest.raises(ValueError, match="no stage 'fine_tuning', or not yet; there is shooting"):
+        evaluate_run(str(directory), "e", {**settings, "stage": ["shooting", "fine_tuning"]})
     assert (directory / "evaluations/e.csv").read_bytes() == before
     assert (directory / "evaluations/e.yaml").exists()
 
 
 def test_unknown_stage_is_refused_before_anything_starts(tmp_path: Path) -> None:
     file = campaign_file(tmp_path, stage=["shooting", "fine"])
-    with pytest.raises(CampaignError, match=r"'fine'; the stages .* shooting, cloning, tuning"):
+    with pytest.raises(
+        CampaignError, match=r"'fine'; the stages .* shooting, cloning, fine_tuning"
+    ):
         plan(read_campaign(str(file)), tmp_path / "out")
 
 
 @pytest.mark.parametrize(
-    ("shooting", "cloning", "tuning", "visits", "practice"), [(3, 2, 4, 5, 7), (1, 1, 0, 1, 1)]
+    ("shooting", "cloning", "fine_tuning", "visits", "practice"), [(3, 2, 4, 5, 7), (1, 1, 0, 1, 1)]
 )
 def test_steps_are_those_that_the_algorithm_counts(
-    shooting: int, cloning: int, tuning: int, visits: int, practice: int
+    shooting: int, cloning: int, fine_tuning: int, visits: int, practice: int
 ) -> None:
-    overrides = {"shooting_iterations": shooting, "outer_iterations": shooting + cloning + tuning}
+    overrides = {
+        "shooting_iterations": shooting,
+        "outer_iterations": shooting + cloning + fine_tuning,
+    }
     config = OmegaConf.merge(
         compose("mbmf/inverted_pendulum", [*TINY, "run_dir=unused"]),
         {**overrides, "cloning": {"iterations": cloning, "episodes": visits}},
-        {"tuning": {"episodes": practice}},
+        {"fine_tuning": {"episodes": practice}},
     )
     algorithm = OmegaConf.to_object(config).build()
     planned = PlannedRun({}, 0, 0, RunDirectory("unused"), config)

@@ -21,6 +21,7 @@ from torchrl_l1.dynamics import (
     make_dynamics,
     make_head,
 )
+from torchrl_l1.dynamics.likelihood import NegativeLogLikelihood
 
 
 def bounded(raw: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -68,6 +69,16 @@ def test_gradients_under_transforms_are_the_same() -> None:
     torch.testing.assert_close(torch.func.grad(loss)(raw, target), expected)
     each = torch.func.vmap(torch.func.grad(loss))(raw, target)
     torch.testing.assert_close(each, expected)
+
+
+def test_gradients_agree_with_finite_differences() -> None:
+    head = GaussianHead(2).double()
+    raw = torch.randn(3, 2, 4, dtype=torch.float64, requires_grad=True)
+    target = torch.randn(2, 2, dtype=torch.float64, requires_grad=True)
+    bounds = (head.min_log_variance, head.max_log_variance)
+    assert torch.autograd.gradcheck(
+        lambda *inputs: NegativeLogLikelihood.apply(*inputs)[0], (raw, target, *bounds)
+    )
 
 
 def test_second_derivatives_are_refused_rather_than_wrong() -> None:

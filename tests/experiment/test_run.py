@@ -27,9 +27,14 @@ METRPO_RUN = ["outer_iterations=6", "fit.max_epochs=150", "fit.patience=150"]
 # Two rounds of shooting, two of cloning, two of fine-tuning.
 MBMF_RUN = [
     *("outer_iterations=6", "shooting_iterations=2", "cloning.iterations=2", "horizon=10"),
-    *("shooting_episodes=2", "tuning.episodes=2", "tuning.minibatches=2", "evaluation_episodes=2"),
+    *(
+        "shooting_episodes=2",
+        "fine_tuning.episodes=2",
+        "fine_tuning.minibatches=2",
+        "evaluation_episodes=2",
+    ),
     *("shooting.candidates=16", "shooting.horizon=4", "model.hidden=[8]", "fit.max_epochs=20"),
-    *("cloning.max_epochs=20", "tuning.epochs=20", "wandb.mode=disabled"),
+    *("cloning.max_epochs=20", "fine_tuning.epochs=20", "wandb.mode=disabled"),
 ]
 
 

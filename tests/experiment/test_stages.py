@@ -22,9 +22,19 @@ from torchrl_l1.experiment.stages import KINDS, STAGES, kinds_of
 
 TINY = [
     *("outer_iterations=3", "shooting_iterations=1", "cloning.iterations=1", "horizon=8"),
-    *("random_episodes=3", "shooting_episodes=2", "evaluation_episodes=2", "tuning.episodes=2"),
-    *("shooting.horizon=3", "shooting.candidates=8", "model.hidden=[8]", "hidden=[8]"),
-    *("tuning.value_hidden=[8]", "tuning.minibatches=2", "fit.max_epochs=2", "fit.batch_size=8"),
+    *(
+        "random_episodes=3",
+        "shooting_episodes=2",
+        "evaluation_episodes=2",
+        "fine_tuning.episodes=2",
+    ),
+    *("shooting.horizon=3", "shooting.candidates=8", "model.hidden=[8]", "policy.hidden=[8]"),
+    *(
+        "fine_tuning.value_hidden=[8]",
+        "fine_tuning.minibatches=2",
+        "fit.max_epochs=2",
+        "fit.batch_size=8",
+    ),
     *("fit.validation_fraction=0.3", "cloning.max_epochs=2", "l1=off", "wandb.mode=disabled"),
 ]
 
@@ -56,7 +66,7 @@ def test_planners_act_in_one_way_and_policies_in_two(trained: Path) -> None:
     assert {name: len(kinds_of(policy)) for name, policy in policies.items()} == {
         "shooting": 1,
         "cloning": 2,
-        "tuning": 2,
+        "fine_tuning": 2,
     }
 
 
@@ -70,7 +80,7 @@ def test_each_stage_is_evaluated_on_its_own(
     # The planner's sampled and mean actions would say the same twice.
     assert cells == {
         ("shooting", "stochastic"),
-        *((stage, kind) for stage in ("cloning", "tuning") for kind in KINDS),
+        *((stage, kind) for stage in ("cloning", "fine_tuning") for kind in KINDS),
     }
     assert len(rows) == 5 * 2 * 2
     returns = {row["stage"]: row["return_mean"] for row in rows if row["policy"] == "stochastic"}
@@ -86,9 +96,9 @@ def test_last_stage_is_the_default_and_is_named(trained: Path) -> None:
     loaded = load_run(trained)
     default, named, other = (
         next(evaluate(loaded, [Condition("off", "none", 0.0, 1.0, "stochastic", stage=name)], 2))
-        for name in (None, "tuning", "cloning")
+        for name in (None, "fine_tuning", "cloning")
     )
-    assert default["stage"] == named["stage"] == "tuning"
+    assert default["stage"] == named["stage"] == "fine_tuning"
     assert default["return_mean"] == named["return_mean"] != other["return_mean"]
 
 
@@ -97,11 +107,11 @@ def test_stage_not_reached_is_refused_before_any_work(
 ) -> None:
     early = train(tmp_path / "early", "outer_iterations=2")
     output = tmp_path / "output"
-    for names in (["tuning"], ["cloning", "tuning"]):
+    for names in (["fine_tuning"], ["cloning", "fine_tuning"]):
         with pytest.raises(SystemExit):
             main(["evaluate", str(early), "--stage", *names, "--output", str(output)])
         error = capsys.readouterr().err
-        assert "no stage 'tuning', or not yet; there are shooting, cloning" in error
+        assert "no stage 'fine_tuning', or not yet; there are shooting, cloning" in error
         assert str(early) in error
     assert not output.exists()
 

@@ -88,12 +88,12 @@ def test_return_of_a_stage_is_that_of_its_last_iterations(
             write_mbmf(seed, arm)
     every = stage_rows(study(tmp_path))
     kinds = [("shooting", ""), ("cloning", "deterministic")]
-    kinds += [("tuning", "stochastic"), ("tuning", "deterministic")]
+    kinds += [("fine_tuning", "stochastic"), ("fine_tuning", "deterministic")]
     assert [(row["stage"], row["policy"]) for row in every] == 2 * kinds
     rows = {(r["l1"], r["stage"]): r for r in every if r["policy"] != "deterministic"}
     rows |= {(r["l1"], r["stage"]): r for r in every if r["stage"] == "cloning"}
     # Three iterations of the first and third stage, the last of the second.
-    expected = {"shooting": -20.0, "cloning": -11.0, "tuning": -6.0}
+    expected = {"shooting": -20.0, "cloning": -11.0, "fine_tuning": -6.0}
     for name, value in expected.items():
         row = rows["off", name]
         assert row["return_mean"] == pytest.approx(value - 0.1)
@@ -110,7 +110,7 @@ def test_return_of_a_stage_is_that_of_its_last_iterations(
         assert row["pairs"] == 3
     # L1 acts in the first stage alone.
     assert rows["paper", "shooting"]["switches_per_1000"] == pytest.approx(20)
-    assert "switches_per_1000" not in rows["paper", "tuning"]
+    assert "switches_per_1000" not in rows["paper", "fine_tuning"]
 
 
 def test_last_stage_is_the_return_of_the_training(write_mbmf: WriteRun, tmp_path: Path) -> None:
@@ -213,7 +213,7 @@ def test_frozen_stages_are_rows_and_panels(
     write_mbmf: WriteRun, tmp_path: Path, drawn: dict[str, Figure]
 ) -> None:
     both = ("stochastic", "deterministic")
-    tests = frozen("shooting", "tuning", policies=both)
+    tests = frozen("shooting", "fine_tuning", policies=both)
     for seed in range(3):
         write_mbmf(seed, evaluations={"shooting_frozen": tests, "disturbances": tests})
     rows = evaluation_rows(study(tmp_path), "disturbances")
@@ -221,10 +221,10 @@ def test_frozen_stages_are_rows_and_panels(
     # Planners act in one way.
     assert len(keys) == len(set(keys)) == 4 + 2 * 4
     assert {policy for stage, policy, *_ in keys if stage == "shooting"} == {"stochastic"}
-    assert [key[0] for key in keys] == ["shooting"] * 4 + ["tuning"] * 8
+    assert [key[0] for key in keys] == ["shooting"] * 4 + ["fine_tuning"] * 8
     means = {key: row["return_mean"] for key, row in zip(keys, rows, strict=True)}
     assert means["shooting", "stochastic", 1.0, "off"] == -18
-    assert means["tuning", "deterministic", 1.0, "paper"] == -4
+    assert means["fine_tuning", "deterministic", 1.0, "paper"] == -4
     assert rows[1]["difference_mean"] == 8
     page = report([tmp_path / "runs"], tmp_path / "out").read_text()
     titles = {
@@ -234,13 +234,13 @@ def test_frozen_stages_are_rows_and_panels(
     }
     assert titles == {
         "shooting": ["random shooting"] * 2,
-        "tuning": ["fine-tuning, sampled actions"] * 2 + ["fine-tuning, mean action"] * 2,
+        "fine_tuning": ["fine-tuning, sampled actions"] * 2 + ["fine-tuning, mean action"] * 2,
     }
     assert "trained with no noise and L1 off, stage shooting](disturbances_" in page
     section = page.split("## Evaluation `shooting_frozen`")[1].split("\n## ")[0]
     sampled, mean_action = re.split(r"Trained with L1 off, ", section)[1:]
     assert [line.split(" | ")[1] for line in sampled.splitlines() if "inverted" in line] == [
-        *("shooting", "shooting", "tuning", "tuning"),
+        *("shooting", "shooting", "fine_tuning", "fine_tuning"),
     ]
     assert "| shooting |" not in mean_action
     with (tmp_path / "out/shooting_frozen.csv").open() as file:
@@ -256,7 +256,7 @@ def test_planner_alone_is_not_said_to_sample(write_mbmf: WriteRun, tmp_path: Pat
 
 
 def test_tests_without_a_stage_have_no_such_column(write_mbmf: WriteRun, tmp_path: Path) -> None:
-    tests = [{k: v for k, v in row.items() if k != "stage"} for row in frozen("tuning")]
+    tests = [{k: v for k, v in row.items() if k != "stage"} for row in frozen("fine_tuning")]
     write_mbmf(0, evaluations={"e": tests})
     assert all("stage" not in row for row in evaluation_rows(study(tmp_path), "e"))
 
@@ -268,9 +268,9 @@ def test_time_is_told_stage_by_stage(write_mbmf: WriteRun, tmp_path: Path) -> No
     assert {k: rows["shooting"][k] for k in ("fit", "collect", "clone", "runs")} == {
         "fit": 4.0, "collect": 6.0, "clone": 0.0, "runs": 2,
     }  # fmt: skip
-    assert rows["tuning"]["tune"] == 1.0
+    assert rows["fine_tuning"]["tune"] == 1.0
     # 4 x 10 s, 3 x 3 s, 5 x 1 s.
-    assert [rows[s]["share"] for s in ("shooting", "cloning", "tuning")] == [
+    assert [rows[s]["share"] for s in ("shooting", "cloning", "fine_tuning")] == [
         pytest.approx(seconds / 54) for seconds in (40, 9, 5)
     ]
     assert rows["shooting"]["ms_per_step"] == pytest.approx(40_000 / 5000)

@@ -2,7 +2,12 @@
 
 from torchrl_l1.algorithms.collection import Perturbation
 from torchrl_l1.algorithms.mbmf import MBMF
-from torchrl_l1.algorithms.mbmf_config import CloningConfig, MBMFConfig, TuningConfig
+from torchrl_l1.algorithms.mbmf_config import (
+    ClonedPolicyConfig,
+    CloningConfig,
+    FineTuningConfig,
+    MBMFConfig,
+)
 from torchrl_l1.algorithms.metrpo import METRPO
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig, PolicyConfig
 from torchrl_l1.algorithms.model_config import ModelConfig
@@ -13,12 +18,13 @@ __all__ = [
     "MBMF",
     "METRPO",
     "PETS",
+    "ClonedPolicyConfig",
     "CloningConfig",
+    "FineTuningConfig",
     "MBMFConfig",
     "METRPOConfig",
     "ModelConfig",
     "PETSConfig",
     "Perturbation",
     "PolicyConfig",
-    "TuningConfig",
 ]

@@ -33,10 +33,16 @@ def check_plans(settings: PlanSettings, optimizer: str, horizon: int) -> None:
             f"replan_every must be between 1 and {optimizer}.horizon ({horizon}), got "
             f"{settings.replan_every}"
         )
-    try:
-        resolve_compilation(settings.compile_plans, propagation=settings.propagation)
-    except ValueError as error:
-        raise ValueError(f"compile_plans: {error}") from error
+    resolve_compilation(
+        settings.compile_plans, propagation=settings.propagation, name="compile_plans"
+    )
+
+
+def check_counts(settings: object, *names: str, prefix: str = "") -> None:
+    """Refuse counts below one, with a ``ValueError``."""
+    for name in names:
+        if getattr(settings, name) < 1:
+            raise ValueError(f"{prefix}{name} must be at least 1, got {getattr(settings, name)}")
 
 
 def check_steps(name: str, value: int | None) -> None:

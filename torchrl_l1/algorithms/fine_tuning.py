@@ -13,7 +13,7 @@ from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOpe
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from torchrl_l1.algorithms.mbmf_config import TuningConfig
+from torchrl_l1.algorithms.mbmf_config import FineTuningConfig
 from torchrl_l1.algorithms.policy import GaussianPolicy
 from torchrl_l1.dynamics import Normalizer
 from torchrl_l1.envs import Task
@@ -23,8 +23,8 @@ _LOG_PROB = "sampled_log_prob"
 
 
 @dataclass
-class TuningReport:
-    """Outcome of a round: means over its last pass, for the policy and for the value network.
+class FineTuningReport:
+    """Outcome of a round: means over the last pass, of whichever network.
 
     Attributes:
         kl: estimate of the KL divergence from the policy that collected, nats.
@@ -47,7 +47,7 @@ class FineTuning:
         config: settings.
     """
 
-    def __init__(self, policy: GaussianPolicy, config: TuningConfig) -> None:
+    def __init__(self, policy: GaussianPolicy, config: FineTuningConfig) -> None:
         self.policy, self.config = policy, config
         width = policy.normalizer.mean.shape[0]
         self.value = _Value(policy.normalizer, MLP(width, 1, num_cells=config.value_hidden))
@@ -62,9 +62,9 @@ class FineTuning:
         self.loss = ClipPPOLoss(
             _sampling_actor(policy),
             critic,
-            clip_epsilon=config.clip,
-            entropy_bonus=config.entropy > 0,
-            entropy_coeff=config.entropy,
+            clip_epsilon=config.clip_epsilon,
+            entropy_bonus=config.entropy_coefficient > 0,
+            entropy_coeff=config.entropy_coefficient,
             loss_critic_type="l2",
             functional=False,
         )
@@ -78,7 +78,7 @@ class FineTuning:
             ),
         }
 
-    def step(self, data: TensorDictBase, progress: float = 0.0) -> TuningReport:
+    def step(self, data: TensorDictBase, progress: float = 0.0) -> FineTuningReport:
         """One round of PPO on episodes ``[N, T]`` that :func:`exploring` has collected.
 
         Args:
@@ -97,12 +97,14 @@ class FineTuning:
         if not torch.isfinite(data["advantage"]).all():
             raise ValueError("PPO: non-finite advantages; check rewards and value estimates")
         keys = ("observation", _SAMPLED, _LOG_PROB, "advantage", "value_target")
-        samples = data.select(*keys).reshape(-1)
+        # Steps that the simulator could not take did not happen.
+        happened = ~data["next", "non_finite"].squeeze(-1)
+        samples = data.select(*keys)[happened]
         reports: list[TensorDictBase] = []
         for epoch in range(max(config.epochs, config.value_epochs)):
             order = torch.randperm(samples.shape[0], device=samples.device)
             reports.clear()
-            for index in order.chunk(config.minibatches):
+            for index in order.tensor_split(min(config.minibatches, len(order))):
                 report = self.loss(samples[index])
                 self._descend(report, epoch)
                 reports.append(report.detach())
@@ -110,7 +112,7 @@ class FineTuning:
         kl, clip_fraction, value_loss, explained = (
             torch.stack([report[name] for report in reports]).mean().item() for name in names
         )
-        return TuningReport(kl, clip_fraction, value_loss, explained)
+        return FineTuningReport(kl, clip_fraction, value_loss, explained)
 
     def _descend(self, report: TensorDictBase, epoch: int) -> None:
         """A gradient step of the networks whose passes are not over."""

@@ -12,12 +12,14 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
+from dataclasses import replace
 from functools import partial
 from time import perf_counter
 from typing import Any
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 from torchrl_l1.algorithms.algorithm import IterationResult
 from torchrl_l1.algorithms.cloning import Cloning
@@ -31,7 +33,7 @@ from torchrl_l1.algorithms.device import resolve_device
 from torchrl_l1.algorithms.fine_tuning import FineTuning
 from torchrl_l1.algorithms.mbmf_config import MBMFConfig
 from torchrl_l1.algorithms.mbmf_environments import StageEnvironments
-from torchrl_l1.algorithms.mbmf_metrics import STAGES, cloning_metrics, tuning_metrics
+from torchrl_l1.algorithms.mbmf_metrics import STAGES, cloning_metrics, fine_tuning_metrics
 from torchrl_l1.algorithms.metrics import fit_metrics
 from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.policy import GaussianPolicy
@@ -40,7 +42,7 @@ from torchrl_l1.control import L1Config
 from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.dynamics import make_dynamics
 from torchrl_l1.envs import get_task
-from torchrl_l1.planning import ModelPredictiveController, TrajectorySampler
+from torchrl_l1.planning import ModelPredictiveController, ShootingConfig, TrajectorySampler
 
 _PHASES = ("random", "fit", "clone", "tune", "collect", "evaluate")
 
@@ -85,23 +87,26 @@ class MBMF:
         self.dynamics = make_dynamics(n, m, **vars(config.model)).to(self.device)
         on_cpu = self.device.type == "cpu"
         self.acting_dynamics = self.dynamics if on_cpu else deepcopy(self.dynamics).cpu()
-        self.planner = self._planner()
-        self.initial = GaussianPolicy(n, m, config.hidden, config.cloning.std)
+        self.planner = self._planner(config.shooting)
+        # In a state that the policy has visited there is no previous plan; the middle of the
+        # bounds must not stand for one: where doing nothing is good, it would beat every draw.
+        self.labeller = self._planner(replace(config.shooting, warm_start=False))
+        self.initial = GaussianPolicy(n, m, config.policy.hidden, config.cloning.std)
         self.clone, self.policy = deepcopy(self.initial), deepcopy(self.initial)
-        self.tuning = FineTuning(self.policy, config.tuning)
+        self.fine_tuning = FineTuning(self.policy, config.fine_tuning)
 
         self.real = StageEnvironments(
             self.task,
             config,
             self.acting_dynamics,
-            self.planner,
-            self.clone if config.cloning.states == "current" else self.initial,
-            self.clone,
-            self.policy,
-            l1,
-            perturbation or Perturbation(),
-            horizon,
-            compile_l1,
+            planner=self.planner,
+            visiting=self.clone if config.cloning.label_states == "current" else self.initial,
+            clone=self.clone,
+            policy=self.policy,
+            l1=l1,
+            perturbation=perturbation or Perturbation(),
+            horizon=horizon,
+            compile_l1=compile_l1,
         )
         rounds = config.shooting_iterations + config.cloning.iterations
         collected = config.collected_episodes(rounds) * self.real.shooting.horizon
@@ -113,7 +118,7 @@ class MBMF:
 
     def iterate(self) -> Iterator[IterationResult]:
         """Run the outer iterations that are left, of all stages, reporting after each."""
-        rounds = {"shooting": self._shoot, "cloning": self._clone, "tuning": self._tune}
+        rounds = {"shooting": self._shoot, "cloning": self._clone, "fine_tuning": self._fine_tune}
         while self.iteration < self.config.outer_iterations:
             seed_streams(self.seed, "iteration", self.iteration)
             self._seconds = dict.fromkeys(_PHASES, 0.0)
@@ -135,7 +140,7 @@ class MBMF:
             return "shooting", iteration
         if iteration < shooting + cloning:
             return "cloning", iteration - shooting
-        return "tuning", iteration - shooting - cloning
+        return "fine_tuning", iteration - shooting - cloning
 
     def _shoot(self, number: int) -> dict[str, float]:
         """Stage 1: fit the model, let the planner act, with L1 around it if it is on."""
@@ -146,7 +151,9 @@ class MBMF:
         with self._phase("collect", "planning and collecting"):
             data = self.real.shooting.collect(self.seed, self.iteration)
             self.learning.store(data)
-            self.cloning.store(data["observation"].flatten(0, 1), data["action"].flatten(0, 1))
+            # What follows in a plan that is a few steps old does not answer the state.
+            planned = data[(data["plan", "step"] % self.config.replan_every == 0).squeeze(-1)]
+            self.cloning.store(planned["observation"], planned["action"])
         full = data
         if self.real.shooting.horizon < self.real.shooting_measured.horizon:
             with self._phase("evaluate", "evaluating"):
@@ -155,36 +162,35 @@ class MBMF:
             **_returns(full, full),
             **signal_metrics(data),
             **fit,
-            "plan/promised_return": data["next", "plan", "best_return"].mean().item(),
+            "plan/promised_return": _finite_mean(data["next", "plan", "best_return"]),
         }
 
     def _clone(self, number: int) -> dict[str, float]:
         """Stage 2: the policy visits states, the planner labels them, the policy is fitted."""
-        fit = self._fit()
-        labels = {}
+        metrics = self._fit()
         if number > 0:
             with self._phase("collect", "visiting states and labelling them"):
                 data = self.real.visits.collect(self.seed, self.iteration)
                 self.learning.store(data)
                 states = data["observation"].flatten(0, 1)
-                plans = self.planner.plan(states)
-                self.cloning.store(states, plans.actions[:, 0].cpu())
-                labels["plan/promised_return"] = plans.best_return.mean().item()
+                plans = self.labeller.plan(states)
+                found = plans.best_return.isfinite().cpu()
+                self.cloning.store(states[found], plans.actions[:, 0].cpu()[found])
+            metrics |= signal_metrics(data)
+            metrics["plan/promised_return"] = _finite_mean(plans.best_return)
         with self._phase("clone", "cloning"):
             report = self.cloning.fit(lambda epoch: self.on_phase(f"cloning, epoch {epoch}"))
         with self._phase("evaluate", "evaluating"):
-            data = self.real.clone_measured.evaluate(self.seed, self.iteration)
+            measured = self.real.clone_measured.evaluate(self.seed, self.iteration)
         return {
-            **_returns(data, data),
-            **signal_metrics(data),
-            **fit,
-            **labels,
+            **_returns(measured, measured),
+            **metrics,
             **cloning_metrics(report, len(self.cloning.buffer)),
         }
 
-    def _tune(self, number: int) -> dict[str, float]:
+    def _fine_tune(self, number: int) -> dict[str, float]:
         """Stage 3: the policy acts without a model, and PPO learns from that."""
-        config = self.config.tuning
+        config = self.config.fine_tuning
         if number == 0:
             self.policy.load_state_dict(self.clone.state_dict())
             self.policy.reset_std(config.std)
@@ -192,7 +198,7 @@ class MBMF:
             data = self.real.practice.collect(self.seed, self.iteration)
         done = number * self.real.practice.frames / (config.anneal_steps or math.inf)
         with self._phase("tune", "PPO"):
-            report = self.tuning.step(data, min(done, 1.0))
+            report = self.fine_tuning.step(data, min(done, 1.0))
         with self._phase("evaluate", "evaluating"):
             evaluate = partial(self.real.policy_measured.evaluate, self.seed, self.iteration)
             shorter = self.real.practice.horizon < self.real.policy_measured.horizon
@@ -202,7 +208,7 @@ class MBMF:
         return {
             **returns,
             **signal_metrics(data),
-            **tuning_metrics(report),
+            **fine_tuning_metrics(report),
             "policy/std": self.policy.log_std.detach().exp().mean().item(),
         }
 
@@ -219,7 +225,7 @@ class MBMF:
         yield
         self._seconds[name] += perf_counter() - start
 
-    def _planner(self) -> ModelPredictiveController:
+    def _planner(self, shooting: ShootingConfig) -> ModelPredictiveController:
         config, task = self.config, self.task
         sampler = TrajectorySampler(
             self.dynamics,
@@ -232,7 +238,7 @@ class MBMF:
             compile=config.compile_plans,  # type: ignore[arg-type]
         )
         return ModelPredictiveController(
-            sampler, config.shooting, *self._bounds(), replan_every=config.replan_every
+            sampler, shooting, *self._bounds(), replan_every=config.replan_every
         )
 
     def _bounds(self) -> tuple[float, float]:
@@ -256,12 +262,13 @@ class MBMF:
         return {"device": str(self.device), **self.planner.sampler.choices()}
 
     def weights(self) -> dict[str, dict[str, Any]]:
-        """State dicts of the model, the cloned policy and the one that PPO improves."""
-        return {
-            "model": self.dynamics.state_dict(),
-            "clone": self.clone.state_dict(),
-            "policy": self.policy.state_dict(),
-        }
+        """State dicts of the model, the cloned policy and the one that PPO improves.
+
+        The policies are there once their stage has begun.
+        """
+        networks = {"model": self.dynamics, "clone": self.clone, "policy": self.policy}
+        reached = list(networks.items())[: len(self.policies)]
+        return {name: network.state_dict() for name, network in reached}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue, as plain tensors and numbers."""
@@ -270,7 +277,7 @@ class MBMF:
             "clone": self.clone.state_dict(),
             "policy": self.policy.state_dict(),
             "cloning": self.cloning.state_dict(),
-            "tuning": self.tuning.state_dict(),
+            "fine_tuning": self.fine_tuning.state_dict(),
             **self.learning.state_dict(),
         }
 
@@ -280,9 +287,14 @@ class MBMF:
         self.clone.load_state_dict(state["clone"])
         self.policy.load_state_dict(state["policy"])
         self.cloning.load_state_dict(state["cloning"])
-        self.tuning.load_state_dict(state["tuning"])
+        self.fine_tuning.load_state_dict(state["fine_tuning"])
         self.learning.load_state_dict(state)
         self.acting_dynamics.load_state_dict(self.dynamics.state_dict())
+
+
+def _finite_mean(values: Tensor) -> float:
+    """Mean of the values that are finite; NaN if none is."""
+    return values[values.isfinite()].mean().item()
 
 
 def _returns(sampled: TensorDictBase, mean_action: TensorDictBase) -> dict[str, float]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from torchrl_l1.algorithms.checks import (
     check_choice,
+    check_counts,
     check_plans,
     check_positive,
     check_steps,
@@ -18,6 +19,25 @@ from torchrl_l1.planning import ShootingConfig
 
 
 @dataclass
+class ClonedPolicyConfig:
+    """The policy that clones the planner and is fine-tuned then.
+
+    Attributes:
+        hidden: widths of the hidden layers.
+    """
+
+    hidden: list[int] = field(default_factory=lambda: [64, 64])
+
+    def __post_init__(self) -> None:
+        """Refuse settings that could only fail later.
+
+        Raises:
+            ValueError: naming the setting.
+        """
+        check_widths("policy.hidden", self.hidden)
+
+
+@dataclass
 class CloningConfig:
     """The second stage: a policy network learns what the planner does (DAgger).
 
@@ -26,7 +46,7 @@ class CloningConfig:
             policy visits states, and the planner says what it would do there.
         episodes: real episodes per round but the first, side by side.
         std: standard deviation of the policy's actions there, action units.
-        states: whose states the planner labels: those of the ``current`` policy, or of the
+        label_states: whose states the planner labels: those of the ``current`` policy, or of the
             ``initial`` one with its random weights, as in the published code, where the workers
             that collect never receive what has been learned.
         learning_rate: Adam's step size.
@@ -39,7 +59,7 @@ class CloningConfig:
     iterations: int = 4
     episodes: int = 1
     std: float = 0.005
-    states: str = "current"
+    label_states: str = "current"
     learning_rate: float = 1e-3
     batch_size: int = 500
     max_epochs: int = 100
@@ -52,11 +72,11 @@ class CloningConfig:
         Raises:
             ValueError: naming the setting.
         """
-        check_counts("cloning", self, "iterations", "episodes", "batch_size", "max_epochs")
-        check_counts("cloning", self, "patience")
+        counts = ("iterations", "episodes", "batch_size", "max_epochs", "patience")
+        check_counts(self, *counts, prefix="cloning.")
         check_positive("cloning.std", self.std)
         check_positive("cloning.learning_rate", self.learning_rate)
-        check_choice("cloning.states", self.states, ("current", "initial"))
+        check_choice("cloning.label_states", self.label_states, ("current", "initial"))
         if not 0 < self.validation_fraction < 1:
             raise ValueError(
                 "cloning.validation_fraction must be between 0 and 1, got "
@@ -65,7 +85,7 @@ class CloningConfig:
 
 
 @dataclass
-class TuningConfig:
+class FineTuningConfig:
     """The third stage: the cloned policy is improved by PPO on real data (arXiv 1707.06347).
 
     Attributes:
@@ -80,8 +100,8 @@ class TuningConfig:
         epochs: passes of the policy over a round's data.
         value_epochs: and of the value network.
         minibatches: gradient steps per pass.
-        clip: bound on the change of the likelihood ratio in the objective.
-        entropy: coefficient of the entropy bonus.
+        clip_epsilon: bound on the change of the likelihood ratio in the objective.
+        entropy_coefficient: weight of the entropy bonus.
         discount: gamma.
         gae_lambda: lambda of the generalized advantage estimate.
         max_gradient_norm: gradients are scaled down to this norm.
@@ -96,8 +116,8 @@ class TuningConfig:
     epochs: int = 10
     value_epochs: int = 10
     minibatches: int = 16
-    clip: float = 0.2
-    entropy: float = 0.0
+    clip_epsilon: float = 0.2
+    entropy_coefficient: float = 0.0
     discount: float = 0.99
     gae_lambda: float = 0.95
     max_gradient_norm: float = 1.0
@@ -108,18 +128,24 @@ class TuningConfig:
         Raises:
             ValueError: naming the setting.
         """
-        check_counts("tuning", self, "episodes", "epochs", "value_epochs", "minibatches")
-        check_widths("tuning.value_hidden", self.value_hidden)
-        positive = ("std", "learning_rate", "value_learning_rate", "clip", "max_gradient_norm")
-        for name in positive:
-            check_positive(f"tuning.{name}", getattr(self, name))
-        if self.anneal_steps is not None:
-            check_counts("tuning", self, "anneal_steps")
-        if not 0 <= self.entropy < math.inf:
-            raise ValueError(f"tuning.entropy must be finite and not negative, got {self.entropy}")
+        counts = ("episodes", "epochs", "value_epochs", "minibatches")
+        check_counts(self, *counts, prefix="fine_tuning.")
+        check_widths("fine_tuning.value_hidden", self.value_hidden)
+        for name in ("std", "learning_rate", "value_learning_rate", "max_gradient_norm"):
+            check_positive(f"fine_tuning.{name}", getattr(self, name))
+        if not 0 < self.clip_epsilon < 1:
+            raise ValueError(
+                f"fine_tuning.clip_epsilon must be between 0 and 1, got {self.clip_epsilon}"
+            )
+        check_steps("fine_tuning.anneal_steps", self.anneal_steps)
+        if not 0 <= self.entropy_coefficient < math.inf:
+            raise ValueError(
+                "fine_tuning.entropy_coefficient must be finite and not negative, got "
+                f"{self.entropy_coefficient}"
+            )
         for name in ("discount", "gae_lambda"):
             if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"tuning.{name} must be in [0, 1], got {getattr(self, name)}")
+                raise ValueError(f"fine_tuning.{name} must be in [0, 1], got {getattr(self, name)}")
 
 
 @dataclass
@@ -144,7 +170,7 @@ class MBMFConfig:
         action_bound: random and planned actions are drawn from this far around zero, within the
             task's own bounds; the whole of these if null. The published code draws from [-1, 1],
             whatever the bounds.
-        particles: imagined trajectories per candidate sequence.
+        particles: imagined trajectories per candidate sequence; with ``mean`` there is one.
         propagation: how they travel through the ensemble: ``tsinf``, ``ts1`` or ``mean``, see
             :func:`~torchrl_l1.planning.evaluate`.
         precision: of the hidden layers in planning: ``float32``, ``bfloat16``, or ``auto`` for
@@ -153,12 +179,12 @@ class MBMFConfig:
             :func:`~torchrl_l1.planning.resolve_compilation`.
         label: action that the model is fitted to: ``nominal`` is the planner's, ``executed`` what
             L1 sends to the actuators.
-        hidden: widths of the policy network's hidden layers.
+        policy: see :class:`ClonedPolicyConfig`.
         shooting: see :class:`~torchrl_l1.planning.ShootingConfig`.
         model: see :class:`ModelConfig`.
         fit: see :class:`~torchrl_l1.dynamics.FitConfig`.
         cloning: see :class:`CloningConfig`.
-        tuning: see :class:`TuningConfig`.
+        fine_tuning: see :class:`FineTuningConfig`.
     """
 
     outer_iterations: int = 59
@@ -176,14 +202,14 @@ class MBMFConfig:
     precision: str = "auto"
     compile_plans: bool | str = "auto"
     label: str = "executed"
-    hidden: list[int] = field(default_factory=lambda: [64, 64])
+    policy: ClonedPolicyConfig = field(default_factory=ClonedPolicyConfig)
     shooting: ShootingConfig = field(
         default_factory=lambda: ShootingConfig(horizon=20, candidates=1000)
     )
     model: ModelConfig = field(default_factory=lambda: ModelConfig(members=1))
     fit: FitConfig = field(default_factory=FitConfig)
     cloning: CloningConfig = field(default_factory=CloningConfig)
-    tuning: TuningConfig = field(default_factory=TuningConfig)
+    fine_tuning: FineTuningConfig = field(default_factory=FineTuningConfig)
 
     def __post_init__(self) -> None:
         """Refuse settings that could only fail later.
@@ -192,16 +218,14 @@ class MBMFConfig:
             ValueError: naming the setting.
         """
         check_choice("label", self.label, ("nominal", "executed"))
-        check_widths("hidden", self.hidden)
-        for name in (
+        check_counts(
+            self,
             "outer_iterations",
             "shooting_iterations",
             "random_episodes",
             "shooting_episodes",
             "evaluation_episodes",
-        ):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        )
         check_steps("episode_steps", self.episode_steps)
         check_steps("random_steps", self.random_steps)
         if not 0 < self.plan_discount <= 1:
@@ -218,12 +242,5 @@ class MBMFConfig:
         return (
             shot * self.shooting_episodes
             + max(cloned - 1, 0) * self.cloning.episodes
-            + (iterations - shot - cloned) * self.tuning.episodes
+            + (iterations - shot - cloned) * self.fine_tuning.episodes
         )
-
-
-def check_counts(prefix: str, settings: object, *names: str) -> None:
-    """Refuse counts below one, with a ``ValueError``."""
-    for name in names:
-        if getattr(settings, name) < 1:
-            raise ValueError(f"{prefix}.{name} must be at least 1, got {getattr(settings, name)}")

@@ -46,6 +46,7 @@ class StageEnvironments:
         task: Task,
         config: MBMFConfig,
         dynamics: EnsembleDynamics,
+        *,
         planner: ModelPredictiveController,
         visiting: GaussianPolicy,
         clone: GaussianPolicy,
@@ -72,6 +73,6 @@ class StageEnvironments:
         )
         self.clone_measured = measured(policy=acting(clone, task))
         self.practice = real(
-            policy=explorer, episodes=config.tuning.episodes, horizon=steps, l1=None
+            policy=explorer, episodes=config.fine_tuning.episodes, horizon=steps, l1=None
         )
         self.policy_measured = measured(policy=explorer)

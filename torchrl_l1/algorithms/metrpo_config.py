@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from torchrl_l1.algorithms.checks import (
     check_choice,
+    check_counts,
     check_positive,
     check_steps,
     check_widths,
@@ -113,9 +114,7 @@ class METRPOConfig:
         check_choice("box_exit", self.box_exit, ("truncate", "fail"))
         check_steps("episode_steps", self.episode_steps)
         counts = ("outer_iterations", "episodes_per_iteration", "evaluation_episodes")
-        for name in (*counts, "trpo_iterations", "imagined_horizon"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_counts(self, *counts, "trpo_iterations", "imagined_horizon")
         if self.imagined_steps < self.imagined_horizon:
             raise ValueError(
                 f"imagined_steps ({self.imagined_steps}) must hold at least one trajectory of "

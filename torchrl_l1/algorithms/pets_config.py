@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from torchrl_l1.algorithms.checks import check_choice, check_plans, check_steps
+from torchrl_l1.algorithms.checks import check_choice, check_counts, check_plans, check_steps
 from torchrl_l1.algorithms.model_config import ModelConfig
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.planning import CEMConfig
@@ -71,9 +71,8 @@ class PETSConfig:
             ValueError: naming the setting.
         """
         check_choice("label", self.label, ("nominal", "executed"))
-        for name in ("outer_iterations", "random_episodes", "episodes_per_iteration", "fit_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        counts = ("outer_iterations", "random_episodes", "episodes_per_iteration", "fit_every")
+        check_counts(self, *counts)
         if self.evaluation_episodes < 0:
             raise ValueError(
                 f"evaluation_episodes must not be negative, got {self.evaluation_episodes}"

@@ -49,7 +49,6 @@ class NegativeLogLikelihood(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
         """Keep what the gradients need."""
         ctx.mark_non_differentiable(*output[1:])
-        ctx.set_materialize_grads(False)
         ctx.target_shape = inputs[1].shape
         ctx.save_for_backward(*output[1:])
 

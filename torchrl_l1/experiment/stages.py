@@ -36,10 +36,10 @@ def find_stage(policies: Mapping[str, TensorDictModuleBase], stage: str | None) 
         >>> policies = {"shooting": TensorDictModule(lambda x: x, ["observation"], ["action"])}
         >>> find_stage(policies, None)
         'shooting'
-        >>> find_stage(policies, "tuning")
+        >>> find_stage(policies, "fine_tuning")
         Traceback (most recent call last):
             ...
-        ValueError: no stage 'tuning', or not yet; there is shooting
+        ValueError: no stage 'fine_tuning', or not yet; there is shooting
     """
     if stage is None:
         return list(policies)[-1]

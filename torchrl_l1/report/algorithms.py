@@ -72,7 +72,7 @@ class AlgorithmFacts:
         """What acts, in words.
 
         Examples:
-            >>> facts("mbmf").acting("stochastic", "tuning")
+            >>> facts("mbmf").acting("stochastic", "fine_tuning")
             'fine-tuning, sampled actions'
             >>> facts("mbmf").acting("stochastic", "shooting"), facts("pets").acting("stochastic")
             ('random shooting', '')
@@ -102,7 +102,7 @@ ALGORITHMS: Mapping[str, AlgorithmFacts] = {
             StageFacts("shooting", "random shooting", policies=("stochastic",), plans=True),
             # Each of its rounds fits the policy anew to all that is known by then.
             StageFacts("cloning", "cloning", window=1, policies=("deterministic",)),
-            StageFacts("tuning", "fine-tuning"),
+            StageFacts("fine_tuning", "fine-tuning"),
         ),
         table="4",
     ),
