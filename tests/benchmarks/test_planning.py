@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from torchrl_l1.planning import compiled_motion
 
 
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
+def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(cheetah, "HIDDEN", (8, 8, 8))
     monkeypatch.setattr(planning, "GRADIENT_STEPS", 1)
     monkeypatch.setattr(planning, "MATRIX", 32)
@@ -30,6 +31,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         torch, "compile", lambda function, **options: compile(function, backend="eager", **options)
     )
+    compiled_motion._compiled.cache_clear()
+    yield
     compiled_motion._compiled.cache_clear()
 
 

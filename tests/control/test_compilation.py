@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch._dynamo.exc import FailOnRecompileLimitHit, TorchDynamoException
 
 from torchrl_l1.control import ActionJacobian, L1Config, augment, init
 from torchrl_l1.control.compilation import compiled
@@ -54,7 +55,7 @@ def test_auto_falls_back_silently_without_a_compiler(monkeypatch, capfd):
         assert options == {"fullgraph": True, "dynamic": False}
 
         def call(*args):
-            raise RuntimeError("no compiler")
+            raise TorchDynamoException("no compiler")
 
         return call
 
@@ -65,7 +66,7 @@ def test_auto_falls_back_silently_without_a_compiler(monkeypatch, capfd):
     expected = trajectory(lambda *args: augment(config, model, *args))
     torch.testing.assert_close(trajectory(step), expected, atol=0, rtol=0)
     assert capfd.readouterr() == ("", "")
-    with pytest.raises(RuntimeError, match="no compiler"):
+    with pytest.raises(TorchDynamoException, match="no compiler"):
         trajectory(make_step(config, model, True))
 
 
@@ -95,6 +96,30 @@ def test_modes():
     def function(x):
         return x
 
-    assert compiled(function, False) is function
+    assert compiled(function, False, dynamic=None) is function
     with pytest.raises(ValueError, match="compile must be True, False or 'auto', got 'yes'"):
-        compiled(function, "yes")
+        compiled(function, "yes", dynamic=None)
+
+
+def test_only_the_compilers_errors_make_auto_fall_back(monkeypatch):
+    """A GPU that is full for a moment is no reason to do without compilation."""
+    errors = [None, torch.OutOfMemoryError("full"), None, FailOnRecompileLimitHit("ninth\nshape")]
+
+    def fake(function, **options):
+        def call(x):
+            if error := errors.pop(0):
+                raise error
+            return function(x)
+
+        return call
+
+    monkeypatch.setattr(torch, "compile", fake)
+    double = compiled(lambda x: 2 * x, "auto", dynamic=None, notice="compiling failed")
+    assert double(1) == 2
+    with pytest.raises(torch.OutOfMemoryError, match="full"):
+        double(2)
+    assert double(3) == 6
+    with pytest.warns(RuntimeWarning, match=r"^compiling failed: ninth$"):
+        assert double(4) == 8
+    # Neither tried nor mentioned again.
+    assert (double(5), errors) == (10, [])

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch._dynamo.exc import TorchDynamoException
 
 from torchrl_l1.dynamics import ControlAffineDynamics, EnsembleDynamics, GaussianHead
 from torchrl_l1.planning import (
@@ -51,7 +52,7 @@ def graphs(monkeypatch) -> list[torch.fx.GraphModule]:
 
 def make_model(head: str = "gaussian", kind: type = EnsembleDynamics, seed: int = 0):
     torch.manual_seed(seed)
-    gaussian = GaussianHead(3) if head == "gaussian" else None
+    gaussian = GaussianHead(3, -8.0 - seed, 0.1 * seed) if head == "gaussian" else None
     model = kind(3, 2, members=5, hidden=(24, 24), activation="silu", head=gaussian)
     model.fit_statistics(torch.randn(99, 3), torch.randn(99, 2), 0.3 * torch.randn(99, 3))
     return model
@@ -158,18 +159,34 @@ def test_eager_plans_do_not_touch_the_compiler(monkeypatch):
 def test_auto_runs_the_operations_one_by_one_where_compiling_fails(monkeypatch):
     def broken(function, **options) -> Callable[..., None]:
         def call(*arguments):
-            raise RuntimeError("no compiler")
+            raise TorchDynamoException("no compiler")
 
         return call
 
     monkeypatch.setattr(torch, "compile", broken)
     model = make_model()
     expected = returns(model, False)
-    with pytest.raises(RuntimeError, match="no compiler"):
+    with pytest.raises(TorchDynamoException, match="no compiler"):
         returns(model, True)
     # As on a GPU.
     monkeypatch.setattr(trajectory_sampling, "resolve_compilation", lambda *settings, **more: True)
-    check_close(returns(model, "auto"), expected)
+    with pytest.warns(RuntimeWarning, match="without compilation, which failed: no compiler") as one:
+        check_close(returns(model, "auto"), expected)
+        check_close(returns(model, "auto"), expected)
+    assert len(one) == 1
+
+
+def test_a_choice_tells_what_is_known_before_the_first_plan(monkeypatch):
+    def plans(mode) -> str:
+        return TrajectorySampler(make_model(), reward, compile=mode).choices()["plans"]
+
+    assert (plans(True), plans(False), plans("auto")) == ("compiled", "eager", "eager")
+    # As on a GPU.
+    monkeypatch.setattr(
+        trajectory_sampling, "resolve_compilation", lambda mode, *settings, **more: mode is not False
+    )
+    assert (plans(True), plans(False)) == ("compiled", "eager")
+    assert plans("auto") == "compiled, or eager if compiling fails"
 
 
 @pytest.mark.parametrize("compiler", [True, False])

@@ -14,14 +14,19 @@ import torch
 CompileMode = bool | Literal["auto"]
 
 
-def compiled(function: FunctionType, mode: CompileMode) -> Callable[..., Any]:
+def compiled(
+    function: FunctionType, mode: CompileMode, *, dynamic: bool | None, notice: str = ""
+) -> Callable[..., Any]:
     """The function, compiled as one graph or not.
 
     Args:
         function: a pure function of tensors.
         mode: ``False`` returns the function itself; ``True`` compiles it and lets a failing
-            compiler raise; ``"auto"`` compiles it and falls back to the function where there
-            is no working compiler.
+            compiler raise; ``"auto"`` compiles it and falls back to the function, for good, where
+            there is no working compiler. Errors of another kind are raised in every mode.
+        dynamic: which sizes a graph leaves open, see :func:`torch.compile`.
+        notice: what a warning says when ``"auto"`` falls back, before the cause; no warning if
+            empty.
 
     Raises:
         ValueError: for any other mode.
@@ -29,20 +34,21 @@ def compiled(function: FunctionType, mode: CompileMode) -> Callable[..., Any]:
     if mode is False:
         return function
     if mode is True or mode == "auto":
-        return _Compiled(function, fall_back=mode == "auto")
+        return _Compiled(function, mode == "auto", dynamic, notice)
     raise ValueError(f"compile must be True, False or 'auto', got {mode!r}")
 
 
 class _Compiled:
     """A compiled function which, if so asked, becomes the plain one once compiling fails."""
 
-    def __init__(self, function: FunctionType, fall_back: bool) -> None:
+    def __init__(
+        self, function: FunctionType, fall_back: bool, dynamic: bool | None, notice: str
+    ) -> None:
         self._function = function
         self._fall_back = fall_back
-        # Environments keep their batch size, so graphs with free sizes would only cost: and
-        # torch cannot make dual tensors of them, which forward-mode Jacobians need.
+        self._notice = notice
         self._compiled: Callable[..., Any] | None = torch.compile(
-            _with_own_code(function), fullgraph=True, dynamic=False
+            _with_own_code(function), fullgraph=True, dynamic=dynamic
         )
         self._called = False
 
@@ -58,13 +64,23 @@ class _Compiled:
                 result = self._compiled(*args)
             self._called = True
             return result
-        except Exception:
-            if not self._fall_back:
+        except Exception as error:
+            if not (self._fall_back and _is_of_the_compiler(error)):
                 raise
+            cause = str(error).strip().partition("\n")[0]
         # If the arguments are at fault, this raises the function's own, clearer error.
         result = self._function(*args)
         self._compiled = None
+        if self._notice:
+            warnings.warn(f"{self._notice}: {cause}", RuntimeWarning, stacklevel=2)
         return result
+
+
+def _is_of_the_compiler(error: Exception) -> bool:
+    # Imported by then: torch wraps in the first of these whatever its backends raise.
+    from torch._dynamo.exc import FailOnRecompileLimitHit, TorchDynamoException
+
+    return isinstance(error, (TorchDynamoException, FailOnRecompileLimitHit))
 
 
 def _with_own_code(function: FunctionType) -> FunctionType:

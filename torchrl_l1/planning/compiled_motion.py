@@ -23,7 +23,10 @@ _Group = tuple[int, int, int]
 
 
 def resolve_compilation(
-    mode: bool | str, device: torch.device | str = "cpu", propagation: str = "tsinf"
+    mode: bool | str,
+    device: torch.device | str = "cpu",
+    propagation: str = "tsinf",
+    name: str = "compile",
 ) -> bool:
     """``"auto"`` becomes ``True`` on a GPU with a compiler, where many small calls cost most.
 
@@ -37,6 +40,7 @@ def resolve_compilation(
         device: where plans are made.
         propagation: how particles travel. ``"ts1"`` is eager: how many rows a member has changes
             from step to step.
+        name: of the setting, in error messages.
 
     Raises:
         ValueError: for another mode, or ``True`` with ``"ts1"``.
@@ -48,11 +52,11 @@ def resolve_compilation(
         if not serves:
             raise ValueError(
                 "propagation 'ts1' cannot be compiled, since members change rows at every step; "
-                "set compile to False or 'auto', or propagation to 'tsinf' or 'mean'"
+                f"set {name} to False or 'auto', or propagation to 'tsinf' or 'mean'"
             )
         return True
     if mode != "auto":
-        raise ValueError(f"compile must be True, False or 'auto', got {mode!r}")
+        raise ValueError(f"{name} must be True, False or 'auto', got {mode!r}")
     return serves and torch.device(device).type == "cuda" and _has_compiler()
 
 
@@ -65,15 +69,16 @@ def compiled_predictor(
 ) -> Predict:
     """What :func:`torchrl_l1.planning.particle_motion.predictor` gives, compiled.
 
-    Ensembles of the same sizes share a graph, whatever their weights and the number of rows.
+    Plans with ensembles of the same shape and precision, the same shares and the same propagation
+    share a graph, whatever the weights and the number of rows.
 
     Args:
         network: the members.
         propagation: ``"tsinf"`` or ``"mean"``.
         shares: particles of each member.
         draws: the noise.
-        mode: ``"auto"`` runs the same operations one by one where the compiler fails, ``True``
-            raises.
+        mode: ``"auto"`` warns where the compiler fails, and runs the same operations one by one;
+            ``True`` raises.
     """
     together = propagation == "mean"
     groups = ((0, network.members, 1),) if together else _groups(shares)
@@ -92,10 +97,12 @@ def compiled_predictor(
     return predict
 
 
-# One for each kind of ensemble: torch keeps eight graphs of a function, and then gives up.
+# One for each kind of plan: torch keeps eight graphs of a function, and then gives up.
 @cache
 def _compiled(kind: tuple[Any, ...], mode: CompileMode) -> Callable[..., Tensor]:
-    return compiled(cast(FunctionType, _change), mode)
+    notice = "plans go on without compilation, which failed"
+    # The number of rows is marked as free; all other sizes are those of the kind.
+    return compiled(cast(FunctionType, _change), mode, dynamic=None, notice=notice)
 
 
 def _groups(shares: list[int]) -> tuple[_Group, ...]:

@@ -17,7 +17,7 @@ Predict = Callable[[Tensor, int], Tensor]
 """Normalised change ``(B, n)`` from raw inputs ``(B, n + m)`` at a step."""
 
 
-def shares(network: PlanningNetwork, particles: int, propagation: Propagation) -> list[int]:
+def member_shares(network: PlanningNetwork, particles: int, propagation: Propagation) -> list[int]:
     """Particles of each member; of no member in particular unless it is kept."""
     if propagation == "tsinf":
         return [len(range(member, particles, network.members)) for member in range(network.members)]

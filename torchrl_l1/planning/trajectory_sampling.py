@@ -20,7 +20,7 @@ from torchrl_l1.planning.network import (
     resolve_precision,
 )
 from torchrl_l1.planning.particle_draws import Draws, scenarios
-from torchrl_l1.planning.particle_motion import Propagation, predictor, shares
+from torchrl_l1.planning.particle_motion import Propagation, member_shares, predictor
 from torchrl_l1.planning.sequences import Evaluate
 
 # Trajectories that go through the horizon together: enough of them to make little of what a call
@@ -76,8 +76,8 @@ def evaluate(
             distribution, comparisons between candidates less variance, and most of the random
             numbers need not be drawn.
         precision: of the hidden layers, see :class:`PlanningNetwork`.
-        block: trajectories that go through the horizon together; ``None`` fits a processor's
-            cache, or takes them all on other devices.
+        block: trajectories that go through the horizon together; as many as fit a
+            processor's cache if ``None``, or 131 072 on other devices.
         discount: the reward of step :math:`t = 0, 1, \ldots` counts ``discount**t`` times.
         compile: whether to compile the motion of the particles, see
             :func:`~torchrl_l1.planning.resolve_compilation`. Eager and compiled returns are
@@ -113,7 +113,7 @@ def evaluate(
     total = torch.zeros(count, device=sequences.device)
     if block is None:
         block = _CPU_BLOCK if sequences.device.type == "cpu" else _OTHER_BLOCK
-    each = shares(network, particles, propagation)
+    each = member_shares(network, particles, propagation)
     rows = network.members if propagation == "mean" else sum(each)
     fused = resolve_compilation(compile, sequences.device, propagation)
     common = None
@@ -185,12 +185,16 @@ class TrajectorySampler:
         )
 
     def choices(self) -> dict[str, str]:
-        """What settings that say ``"auto"`` have become: precision, and compiled or eager plans."""
-        fused = resolve_compilation(self.compile, self.dynamics.device, self.propagation)
-        return {
-            "precision": planning_precision(self.dynamics, self.precision),
-            "plans": "compiled" if fused else "eager",
-        }
+        """What settings that say ``"auto"`` have become: precision, and compiled or eager plans.
+
+        Whether compiling succeeds is seen by the first plan only.
+        """
+        plans = "eager"
+        if resolve_compilation(self.compile, self.dynamics.device, self.propagation):
+            plans = "compiled"
+            if self.compile == "auto":
+                plans += ", or eager if compiling fails"
+        return {"precision": planning_precision(self.dynamics, self.precision), "plans": plans}
 
     def evaluator(self, observation: Tensor, generator: torch.Generator | None = None) -> Evaluate:
         """Returns ``(N, C)`` of sequences ``(N, C, H, m)`` from observations ``(N, n)``."""
