@@ -103,6 +103,33 @@ def test_unknown_stage_is_refused_before_anything_starts(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
+    ("iterations", "asked", "reached"),
+    [(3, "fine_tuning", "shooting, cloning"), (1, "cloning", "shooting")],
+)
+def test_stage_that_a_run_never_reaches_is_refused_before_anything_starts(
+    tmp_path: Path, iterations: int, asked: str, reached: str
+) -> None:
+    campaign = read_campaign(str(campaign_file(tmp_path, stage=["shooting", asked])))
+    assert len(plan(campaign, tmp_path / "out")) == 1
+    campaign.runs[0].overrides.append(f"outer_iterations={iterations}")
+    words = rf"outer_iterations={iterations} .* not reach the stage '{asked}', only {reached};"
+    with pytest.raises(CampaignError, match=words):
+        plan(campaign, tmp_path / "out")
+
+
+def test_a_planner_is_tested_once(tmp_path: Path) -> None:
+    """Tables that say both kinds of policies count all the same."""
+    directory = run(compose("mbmf/inverted_pendulum", [*TINY, f"run_dir={tmp_path}"]))
+    settings = EvaluationSettings("e", l1=["off"], stage=["shooting", "cloning"], episodes=1)
+    with evaluate_run(str(directory), "e", settings.of_a_run()).open() as handle:
+        rows = [(row["stage"], row["policy"]) for row in csv.DictReader(handle)]
+    assert rows == [
+        *(("shooting", "stochastic"), ("cloning", "stochastic"), ("cloning", "deterministic")),
+    ]
+    assert is_evaluated(RunDirectory(directory), settings)
+
+
+@pytest.mark.parametrize(
     ("shooting", "cloning", "fine_tuning", "visits", "practice"), [(3, 2, 4, 5, 7), (1, 1, 0, 1, 1)]
 )
 def test_steps_are_those_that_the_algorithm_counts(

@@ -102,6 +102,17 @@ def test_summary_is_the_median_over_training_seeds() -> None:
     assert "3 training seeds" in table([entry])
 
 
+def test_each_panel_counts_its_own_seeds() -> None:
+    cell = {"noise": "none", "bias": 0.0, "gain": 1.0, "episodes": 5, "l1": "off"}
+    rows = [
+        {**cell, "policy": policy, "return_mean": -1.0}
+        for policy in ("stochastic", "stochastic", "deterministic")
+    ]
+    both, one = table(summarize(rows)).split("\n\n")
+    assert "stochastic" in both and "of 2 training seeds" in both
+    assert "deterministic" in one and one.count("of 1 training seed\n") == 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

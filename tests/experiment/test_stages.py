@@ -61,6 +61,16 @@ def test_stages_of_each_algorithm_are_known(trained: Path) -> None:
     assert tuple(load_run(trained).algorithm.policies) == STAGES["mbmf"]
 
 
+@pytest.mark.parametrize("iterations", range(1, 7))
+def test_settings_tell_which_stages_a_run_reaches(iterations: int) -> None:
+    rounds = ["shooting_iterations=2", "cloning.iterations=3", f"outer_iterations={iterations}"]
+    recipe = OmegaConf.to_object(compose("mbmf/inverted_pendulum", [*TINY, *rounds, "run_dir=no"]))
+    algorithm = recipe.build()
+    algorithm.iteration = iterations
+    assert recipe.stages() == tuple(algorithm.policies)
+    assert len(recipe.stages()) == 1 + (iterations > 2) + (iterations > 5)
+
+
 def test_planners_act_in_one_way_and_policies_in_two(trained: Path) -> None:
     policies = load_run(trained).algorithm.policies
     assert {name: len(kinds_of(policy)) for name, policy in policies.items()} == {
@@ -124,6 +134,30 @@ def test_runs_that_are_differently_far_need_the_name_of_the_stage(tmp_path: Path
     with pytest.raises(ValueError, match=r"one has reached the stage shooting and .*two cloning"):
         evaluate_command._stages(runs, [])
     assert evaluate_command._stages(runs, ["shooting"]) == ["shooting"]
+
+
+def test_runs_that_are_differently_far_share_a_table(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    early = train(tmp_path / "early", "outer_iterations=1", "seed=1")
+    config = OmegaConf.load(early / "config.yaml")
+    config.outer_iterations = 3  # as if it were still running
+    OmegaConf.save(config, early / "config.yaml")
+    command = ["evaluate", str(early), str(trained), "--episodes", "1", "--output", str(tmp_path)]
+    main([*command, "--stage", "shooting", "--l1", "off"])
+    rows = rows_of(tmp_path / "evaluation.csv")
+    assert [(row["training_seed"], row["stage"]) for row in rows] == [
+        *(("1", "shooting"), ("0", "shooting")),
+    ]
+    (entry,) = rows_of(tmp_path / "summary.csv")
+    assert (entry["stage"], entry["training_seeds"]) == ("shooting", "2")
+    assert "of 2 training seeds" in capsys.readouterr().out
+
+
+def test_runs_with_compiled_plans_are_evaluated_without(tmp_path: Path) -> None:
+    loaded = load_run(train(tmp_path / "run", "outer_iterations=1", "compile_plans=auto"))
+    assert loaded.recipe.compile_plans == "auto"
+    assert loaded.algorithm.planner.sampler.compile is False
 
 
 def test_rows_of_a_single_stage_are_as_they_were(tiny_recipe: Callable[..., DictConfig]) -> None:

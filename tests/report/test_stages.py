@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from scipy.stats import t
 
 from torchrl_l1.experiment.run_directory import RunDirectoryError
+from torchrl_l1.experiment.stages import STAGES as ALL_STAGES
 from torchrl_l1.report import curve_panels, evaluation_figures, report
 from torchrl_l1.report.evaluation_tables import evaluation_rows
 from torchrl_l1.report.finding import find_readable_runs, find_runs
@@ -26,6 +27,7 @@ from torchrl_l1.report.variants import Study, studies
 
 WriteRun = Callable[..., Path]
 
+RNG = np.random.default_rng(0)
 PENDULUM = "mbmf/inverted_pendulum"
 STAGE = [1] * 4 + [2] * 3 + [3] * 5
 STEPS = [2000, 3000, 4000, 5000, 5000, 6700, 8400, 12400, 16400, 20400, 24400, 28400]
@@ -123,6 +125,28 @@ def test_last_stage_is_the_return_of_the_training(write_mbmf: WriteRun, tmp_path
     assert mean_action["return_mean"] == row["deterministic_mean"] == row["return_mean"] + 1
 
 
+@pytest.mark.parametrize(
+    ("stages", "expected"),
+    [([1] * 4 + [2] * 6 + [3] * 2, 2), ([1] * 4 + [2] * 7 + [3], 1), ([1] * 4 + [2] * 8, 1)],
+)
+def test_return_of_the_training_is_of_the_last_stage_alone(
+    write_mbmf: WriteRun, tmp_path: Path, stages: list[int], expected: int
+) -> None:
+    """The last of them, as under Stages: two, one, and of cloning the last round."""
+    curves = RNG.normal(-50, 20, (2, 12))
+    for seed, curve in enumerate(curves):
+        columns = {"stage": stages, "return_mean": curve, "return_deterministic": curve + 1}
+        write_mbmf(seed, columns=columns)
+    found = study(tmp_path)
+    ((cell, runs),) = found.cells.items()
+    row = training_row(cell, runs)
+    last = curves[:, -expected:]
+    assert row["return_mean"] == pytest.approx(last.mean())
+    assert row["deterministic_mean"] == pytest.approx(last.mean() + 1)
+    assert row["published_spread"] == pytest.approx(last.std(axis=0).mean())
+    assert stage_rows(found)[-1]["return_mean"] == pytest.approx(last.mean() + 1)
+
+
 def test_unfinished_and_unpaired_runs_enter_no_difference(
     write_mbmf: WriteRun, tmp_path: Path
 ) -> None:
@@ -198,6 +222,41 @@ def test_boundaries_are_marked_and_each_stage_has_a_panel(
     assert len({axis.get_ylim() for axis in panels}) == 1
 
 
+@pytest.mark.parametrize(("done", "shaded"), [(2, 1), (5, 2), (9, 2)])
+def test_stages_of_an_unfinished_run_are_marked_up_to_the_last(
+    write_mbmf: WriteRun, tmp_path: Path, drawn: dict[str, Figure], done: int, shaded: int
+) -> None:
+    write_mbmf(0, done=done)
+    plot_task(study(tmp_path), "inverted_pendulum", tmp_path / "curves.png")
+    (axis,) = drawn["curves"].axes
+    names = ["random shooting", "cloning"][:shaded]
+    assert [patch.get_label() for patch in axis.patches] == names
+    ends = [patch.get_x() + patch.get_width() for patch in axis.patches]
+    last = [max(STEPS[i] for i in range(done) if STAGE[i] == s + 1) for s in range(shaded)]
+    assert [1000 * end for end in ends] == pytest.approx(last)
+
+
+def test_mean_action_has_a_curve_in_fine_tuning_only(
+    write_mbmf: WriteRun, tmp_path: Path, drawn: dict[str, Figure]
+) -> None:
+    write_mbmf(0)
+    found = study(tmp_path)
+    plot_task(found, "inverted_pendulum", tmp_path / "curves.png")
+    plot_stages(found, "inverted_pendulum", tmp_path / "stages.png")
+    last = [i for i, stage in enumerate(STAGE) if stage == 3]
+    for axis in (*drawn["curves"].axes, *drawn["stages"].axes):
+        drawn_lines = [line for line in axis.lines if len(line.get_xdata())]
+        dashed = [line for line in drawn_lines if line.get_linestyle() == "--"]
+        if axis.get_title().endswith(("shooting", ": cloning")):
+            assert not dashed
+        else:
+            (line,) = dashed
+            assert list(1000 * line.get_xdata()) == pytest.approx([STEPS[i] for i in last])
+            assert list(line.get_ydata()) == pytest.approx(returns_of(0)[last] + 1)
+    page = report([tmp_path / "runs"], tmp_path / "out").read_text()
+    assert "dashed: mean of the return with the mean action in fine-tuning; shaded:" in page
+
+
 def test_unfinished_run_shows_the_stages_that_it_has_reached(
     write_mbmf: WriteRun, tmp_path: Path, drawn: dict[str, Figure]
 ) -> None:
@@ -228,7 +287,7 @@ def test_frozen_stages_are_rows_and_panels(
     assert rows[1]["difference_mean"] == 8
     page = report([tmp_path / "runs"], tmp_path / "out").read_text()
     titles = {
-        name.split("_")[-1]: [axis.get_title() for axis in figure.axes]
+        name.partition("_none_off_")[2]: [axis.get_title() for axis in figure.axes]
         for name, figure in drawn.items()
         if name.startswith("disturbances")
     }
@@ -238,15 +297,35 @@ def test_frozen_stages_are_rows_and_panels(
     }
     assert "trained with no noise and L1 off, stage shooting](disturbances_" in page
     section = page.split("## Evaluation `shooting_frozen`")[1].split("\n## ")[0]
-    sampled, mean_action = re.split(r"Trained with L1 off, ", section)[1:]
-    assert [line.split(" | ")[1] for line in sampled.splitlines() if "inverted" in line] == [
-        *("shooting", "shooting", "fine_tuning", "fine_tuning"),
-    ]
-    assert "| shooting |" not in mean_action
+    planned, sampled, mean_action = re.split(r"Trained with L1 off", section)[1:]
+    starts = (":", ", sampled actions:", ", mean action:")
+    for table, start in zip((planned, sampled, mean_action), starts, strict=True):
+        assert table.startswith(start)
+        stage = "shooting" if start == ":" else "fine_tuning"
+        lines = [line for line in table.splitlines() if "inverted" in line]
+        assert [line.split(" | ")[1] for line in lines] == [stage] * 2
     with (tmp_path / "out/shooting_frozen.csv").open() as file:
         assert [row["stage"] for row in csv.DictReader(file)] == [key[0] for key in keys]
     # The paper's table is of the training's own returns.
     assert "| -100.5 ± 4.3" not in section
+
+
+def test_ablation_tells_planners_from_policies(write_mbmf: WriteRun, tmp_path: Path) -> None:
+    tests = frozen("shooting", "fine_tuning", policies=("stochastic", "deterministic"))
+    for arm in ("off", "paper"):
+        write_mbmf(0, arm, evaluations={"ablation": tests})
+    page = report([tmp_path / "runs"], tmp_path / "out").read_text()
+    section = page.split("\n## Ablation\n")[1].split("\n## ")[0]
+    tables = re.findall(r"^L1 paper(.*):\n\n((?:\|.*\n)+)", section, re.MULTILINE)
+    found = [
+        (words, [name for name in ALL_STAGES["mbmf"] if f"| {name} |" in text])
+        for words, text in tables
+    ]
+    assert found == [
+        ("", ["shooting"]),
+        (", sampled actions", ["fine_tuning"]),
+        (", mean action", ["fine_tuning"]),
+    ]
 
 
 def test_planner_alone_is_not_said_to_sample(write_mbmf: WriteRun, tmp_path: Path) -> None:

@@ -123,7 +123,7 @@ def test_report_shows_the_sweep_in_its_section(
     page = report([tmp_path / "runs"])
     section = page.read_text().split("\n## Evaluation `tolerance`\n")[1].split("\n## ")[0]
     picture = "sweep_tolerance_inverted_pendulum_none_off.png"
-    actions = {"stochastic": "sampled actions", "deterministic": "the mean action"}[policy]
+    actions = {"stochastic": "sampled actions", "deterministic": "mean action"}[policy]
     assert f"L1 off; tested with {actions}]({picture})" in section
     assert "dashed, the same policies without L1" in section
     assert "| paper | 0.1 |" in section

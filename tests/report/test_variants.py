@@ -48,6 +48,13 @@ def test_the_controllers_settings_do_not_split_the_baseline(
     assert list(cells(tmp_path).values()) == [[0, 1]]
 
 
+def test_compilation_of_plans_sets_no_runs_apart(write_run: WriteRun, tmp_path: Path) -> None:
+    for seed, mode in enumerate(("auto", "true", "false")):
+        overrides = ("l1=off", f"compile_plans={mode}")
+        write_run([1], *overrides, recipe="pets/inverted_pendulum", seed=seed)
+    assert list(cells(tmp_path).values()) == [[0, 1, 2]]
+
+
 def test_main_settings_are_those_that_cover_most(write_run: WriteRun, tmp_path: Path) -> None:
     for noise in ("none", "action"):
         write_run([1], "l1=off", f"noise={noise}", "label=nominal")

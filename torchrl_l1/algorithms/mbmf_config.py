@@ -244,3 +244,9 @@ class MBMFConfig:
             + max(cloned - 1, 0) * self.cloning.episodes
             + (iterations - shot - cloned) * self.fine_tuning.episodes
         )
+
+    def stages(self) -> tuple[str, ...]:
+        """The stages that ``outer_iterations`` reaches."""
+        cloned = self.shooting_iterations + self.cloning.iterations
+        begin = {"shooting": 0, "cloning": self.shooting_iterations, "fine_tuning": cloned}
+        return tuple(name for name, first in begin.items() if first < self.outer_iterations)

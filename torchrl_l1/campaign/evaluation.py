@@ -8,7 +8,7 @@ from typing import Any
 
 from torchrl_l1.campaign.settings import EvaluationSettings
 from torchrl_l1.campaign.yaml_file import dump_yaml, load_yaml
-from torchrl_l1.experiment.evaluate import conditions, evaluate, load_run
+from torchrl_l1.experiment.evaluate import conditions, distinct, evaluate, load_run
 from torchrl_l1.experiment.run_directory import RunDirectory, write_atomically, write_table
 
 
@@ -55,7 +55,7 @@ def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
         ValueError: for a stage that the run has not; nothing is changed then.
     """
     chosen = EvaluationSettings(name=name, **settings)
-    cells = conditions(
+    every = conditions(
         chosen.l1,
         chosen.noise,
         chosen.bias,
@@ -66,7 +66,7 @@ def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
         chosen.stage,
     )
     trained = load_run(run_dir)
-    rows = list(evaluate(trained, cells, chosen.episodes, chosen.seed))
+    rows = list(evaluate(trained, distinct(trained, every), chosen.episodes, chosen.seed))
     table = evaluation_file(Path(run_dir), name)
     described = table.with_suffix(".yaml")
     table.parent.mkdir(exist_ok=True)

@@ -138,16 +138,25 @@ def _add_evaluations(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
         if not chosen:
             raise CampaignError(f"{place}: no run has all of where")
         for run in chosen:
-            stages = STAGES[run.config.algorithm]
-            unknown = [name for name in settings.stage if name not in stages]
-            if unknown:
-                raise CampaignError(
-                    f"{place}: {run} has no stage {unknown[0]!r}; the stages of its algorithm are "
-                    f"{', '.join(stages)}"
-                )
+            _check_stages(place, run, settings.stage)
             if any(other.name == settings.name for other in run.evaluations):
                 raise CampaignError(
                     f"{place}: another evaluation of this name is for {run} too; give it another "
                     "name or a narrower where"
                 )
             run.evaluations.append(settings)
+
+
+def _check_stages(place: str, run: PlannedRun, asked: Sequence[str]) -> None:
+    every, reached = STAGES[run.config.algorithm], run.stages()
+    for name in asked:
+        if name not in every:
+            raise CampaignError(
+                f"{place}: {run} has no stage {name!r}; the stages of its algorithm are "
+                f"{', '.join(every)}"
+            )
+        if name not in reached:
+            raise CampaignError(
+                f"{place}: with outer_iterations={run.iterations} {run} does not reach the stage "
+                f"{name!r}, only {', '.join(reached)}; raise outer_iterations"
+            )

@@ -51,6 +51,10 @@ class PlannedRun:
         steps = min(self.config.episode_steps or full, full)
         return self._recipe.collected_episodes(iterations) * int(steps)
 
+    def stages(self) -> tuple[str, ...]:
+        """The stages that the run has reached once it is finished."""
+        return self._recipe.stages()
+
     @cached_property
     def _recipe(self) -> RunSettings:
         recipe = OmegaConf.to_object(self.config)

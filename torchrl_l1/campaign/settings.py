@@ -77,7 +77,8 @@ class EvaluationSettings:
         noise: settings of the ``noise`` group.
         bias: actuator biases, action units.
         gain: actuator gains.
-        policy: ``stochastic`` and ``deterministic``.
+        policy: ``stochastic`` and ``deterministic``; a planner, which acts in one way only, is
+            tested once.
         episodes: episodes per cell.
         seed: seed of resets, noise and sampled actions.
         epsilon: tolerances of the switching law, raw state units, as a number or a list; the

@@ -48,8 +48,8 @@ def make_step(config: L1Config, model: ActionJacobian, mode: CompileMode) -> Ste
     def step(state: L1State, observation: Tensor, u_rl: Tensor) -> Step:
         return augment(config, model, state, observation, u_rl)
 
-    # Environments keep their batch size, so graphs with free sizes would only cost: and torch cannot
-    # make dual tensors of them, which forward-mode Jacobians need.
+    # Environments keep their batch size, so graphs with free sizes would only cost: and torch
+    # cannot make dual tensors of them, which forward-mode Jacobians need.
     return compiled(cast(FunctionType, step), mode, dynamic=False)
 
 

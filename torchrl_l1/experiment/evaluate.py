@@ -29,7 +29,7 @@ from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
 from torchrl_l1.experiment.schema import schema_of
 from torchrl_l1.experiment.settings import L1Settings, RunSettings, l1_config
-from torchrl_l1.experiment.stages import find_stage
+from torchrl_l1.experiment.stages import STAGES, find_stage, kinds_of
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,10 @@ def load_run(path: str | Path) -> TrainedRun:
     schema = OmegaConf.structured(schema_of(stored))
     recipe = OmegaConf.to_object(OmegaConf.merge(schema, stored))
     assert isinstance(recipe, RunSettings)
-    algorithm = replace(recipe, device="cpu").build()
+    here: dict[str, Any] = {"device": "cpu"}
+    if hasattr(recipe, "compile_plans"):
+        here["compile_plans"] = False  # as "auto" decides on the CPU
+    algorithm = replace(recipe, **here).build()
     algorithm.load_state_dict({**checkpoint["algorithm"], "buffer": {}})
     return TrainedRun(directory.path, recipe, algorithm)
 
@@ -137,6 +140,24 @@ def conditions(
     )
 
 
+def distinct(trained: TrainedRun, cells: Sequence[Condition]) -> list[Condition]:
+    """Those conditions that differ for a run, with the names of their stages.
+
+    Sampled and mean actions of a planner are the same: of conditions that differ in nothing else
+    the first stays.
+
+    Raises:
+        ValueError: for a stage that the run has not.
+    """
+    found: dict[Condition, Condition] = {}
+    for cell in cells:
+        stage = trained.stage(cell.stage)
+        named = replace(cell, stage=stage)
+        both_ways = len(kinds_of(trained.algorithm.policies[stage])) > 1
+        found.setdefault(named if both_ways else replace(named, policy=""), named)
+    return list(found.values())
+
+
 def evaluate(
     trained: TrainedRun,
     cells: Sequence[Condition],
@@ -147,8 +168,8 @@ def evaluate(
 
     Every condition sees the same resets and the same random numbers. Model and policy are
     those of the run's last checkpoint. ``own_l1`` is 1 where the controller is the one that the
-    run was trained with, else 0; ``epsilon`` and ``alpha`` hold what the condition sets. Where a
-    run has several stages, ``stage`` names the tested one.
+    run was trained with, else 0; ``epsilon`` and ``alpha`` hold what the condition sets. Where an
+    algorithm has several stages, ``stage`` names the tested one.
 
     Raises:
         ValueError: for a stage that the run has not, before anything is evaluated.
@@ -187,7 +208,7 @@ def make_collection(trained: TrainedRun, cell: Condition, episodes: int) -> Coll
 
 def _columns(trained: TrainedRun, cell: Condition) -> dict[str, Any]:
     columns = dict(vars(cell))
-    if len(trained.algorithm.policies) == 1:
+    if len(STAGES[trained.recipe.algorithm]) == 1:
         del columns["stage"]  # there is no choice, and nothing to say
     return columns
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from tqdm import tqdm
 
 from torchrl_l1.experiment.evaluate import (
-    Condition,
     TrainedRun,
     conditions,
+    distinct,
     evaluate,
     load_run,
 )
@@ -22,7 +22,7 @@ from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.robustness import plot_robustness, summarize, table
 from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.experiment.settings import RunSettings, WandbSettings
-from torchrl_l1.experiment.stages import kinds_of
+from torchrl_l1.experiment.stages import KINDS
 
 
 def _check_one_study(runs: Sequence[TrainedRun]) -> None:
@@ -56,26 +56,6 @@ def _stages(runs: Sequence[TrainedRun], asked: Sequence[str]) -> list[str]:
     return found[0]
 
 
-def _cells(
-    options: argparse.Namespace, trained: TrainedRun, stages: Sequence[str]
-) -> list[Condition]:
-    """All conditions; where the kind of policy is left open, those kinds that differ."""
-    return [
-        cell
-        for stage in stages
-        for cell in conditions(
-            options.l1,
-            options.noise,
-            options.bias,
-            options.gain,
-            options.policy or kinds_of(trained.algorithm.policies[stage]),
-            options.epsilon,
-            options.alpha,
-            [stage],
-        )
-    ]
-
-
 def evaluate_command(options: argparse.Namespace) -> None:
     """``torchrl-l1 evaluate``: table on the screen, CSV, PNG and, if asked, a filmstrip."""
     check_tuning(options.epsilon, options.alpha, prefix="--")
@@ -88,7 +68,17 @@ def evaluate_command(options: argparse.Namespace) -> None:
     runs = [load_run(path) for path in dict.fromkeys(map(Path, options.run_dir))]
     _check_one_study(runs)
     stages = _stages(runs, options.stage)
-    cells = _cells(options, runs[0], stages)
+    every = conditions(
+        options.l1,
+        options.noise,
+        options.bias,
+        options.gain,
+        options.policy or KINDS,
+        options.epsilon,
+        options.alpha,
+        stages,
+    )
+    cells = distinct(runs[0], every)
     output = Path(options.output) if options.output else runs[0].path / "evaluation"
     rows = []
     total = len(runs) * len(cells)

@@ -59,7 +59,7 @@ def table(summary: Sequence[Mapping[str, Any]]) -> str:
     for panel, bias, gain in keys:
         if heading != panel:
             heading = panel
-            seeds = summary[0]["training_seeds"]
+            seeds = next(row["training_seeds"] for row in summary if _panel(row) == panel)
             lines.append(
                 f"\n{_panel_words(panel, ' policy, noise ')}: mean return, "
                 f"median [lowest, highest] of {seeds} training seed{'s' * (seeds > 1)}"

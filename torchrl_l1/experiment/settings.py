@@ -15,6 +15,7 @@ from torchrl_l1.algorithms.device import DEVICES
 from torchrl_l1.control import L1Config
 from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.envs import get_task
+from torchrl_l1.experiment.stages import STAGES
 
 
 @dataclass
@@ -120,6 +121,10 @@ class RunSettings(ABC):
     @abstractmethod
     def collected_episodes(self, iterations: int) -> int:
         """Real episodes of so many outer iterations; random data do not count."""
+
+    def stages(self) -> tuple[str, ...]:
+        """The stages that ``outer_iterations`` reaches, see :data:`STAGES`."""
+        return STAGES[self.algorithm]
 
     @abstractmethod
     def build(self) -> Algorithm:

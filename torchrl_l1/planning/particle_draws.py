@@ -31,7 +31,8 @@ class Draws:
 
     Args:
         network: the members.
-        shares: particles of each member, see :func:`torchrl_l1.planning.particle_motion.member_shares`.
+        shares: particles of each member, see
+            :func:`torchrl_l1.planning.particle_motion.member_shares`.
         count: number of trajectories, B.
         horizon: number of steps.
         common: what all candidates draw; each draws its own if ``None``.

@@ -97,8 +97,8 @@ def _introduction(page: Page, every: Sequence[Study], found: Findings, command: 
 def _algorithms(every: Sequence[Study]) -> str:
     """Which algorithms there are; nothing to say where it is METRPO alone."""
     if len(every) == 1:
-        algorithm = every[0].facts
-        return "" if algorithm.released else f"The algorithm is {algorithm.name}."
+        (study,) = every
+        return "" if study.algorithm == "metrpo" else f"The algorithm is {study.facts.name}."
     numbers = ", ".join(f"{study.facts.name} ({len(study.runs)} runs)" for study in every)
     return (
         f"Algorithms: {numbers}. Their runs are never pooled: each has sections of its own, with "

@@ -30,15 +30,21 @@ class Line:
         label: in the legend.
         color: of its curves.
         runs: its runs.
-        mean_action: whether the return with the mean action is a curve of its own.
+        mean_action: places of the stages, see :meth:`Run.during`, in which the return with the mean
+            action is a curve of its own.
         style: of its curves, as matplotlib takes it.
     """
 
     label: str
     color: str
     runs: Sequence[Run]
-    mean_action: bool
+    mean_action: Sequence[int] = ()
     style: Any = "-"
+
+    def own(self, run: Run) -> np.ndarray:
+        """Outer iterations ``(T,)`` in which the return with the mean action is drawn."""
+        never = np.full(len(run.returns), False)
+        return np.logical_or.reduce([never, *(run.during(place) for place in self.mean_action)])
 
 
 @dataclass(frozen=True)
@@ -82,9 +88,10 @@ class Panel:
         lines = [line for line in self.lines if any(len(run.returns) for run in line.runs)]
         return replace(self, lines=lines)
 
-    def part(self, run: Run) -> np.ndarray | slice:
-        """Which outer iterations of a run are drawn."""
-        return slice(None) if self.stage is None else run.during(self.stage)
+    def part(self, run: Run) -> np.ndarray:
+        """Which outer iterations ``(T,)`` of a run are drawn."""
+        every = np.full(len(run.returns), True)
+        return every if self.stage is None else run.during(self.stage)
 
 
 def plot_panels(panels: Sequence[Panel], file: Path, same_scale: bool = False) -> Path | None:
@@ -137,17 +144,24 @@ def _draw(axis: Axes, panel: Panel) -> list[np.ndarray]:
                 axis.plot([], [], ":", color="0.2", linewidth=0.8, label="unfinished run")
         done = [run for run in line.runs if run.finished]
         if done:
-            steps, means, mean_action = np.mean(
-                [
-                    [values[panel.part(r)] for values in (r.real_steps, r.returns, r.deterministic)]
-                    for r in done
-                ],
+            steps, means = np.mean(
+                [[values[panel.part(r)] for values in (r.real_steps, r.returns)] for r in done],
                 axis=0,
             )
             dots = _dots(steps)
             _line(axis, steps, means, line.style, line.color, 2.2, label=line.label, marker=dots)
-            if line.mean_action:
-                _line(axis, steps, mean_action, "--", line.color, 1.4)
+            steps, mean_action = np.mean(
+                [
+                    [
+                        values[line.own(r) & panel.part(r)]
+                        for values in (r.real_steps, r.deterministic)
+                    ]
+                    for r in done
+                ],
+                axis=0,
+            )
+            if len(steps):
+                _line(axis, steps, mean_action, "--", line.color, 1.4, marker=_dots(steps))
                 axis.plot([], [], "--", color="0.2", linewidth=1.4, label="mean action")
                 shown.append(mean_action)
     for band, shade in zip(panel.bands, _SHADES, strict=False):

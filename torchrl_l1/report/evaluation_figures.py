@@ -80,7 +80,7 @@ def plot_disturbances(
     policy, with the interval of its own mean.
 
     Args:
-        rows: of one training cell, tested under several biases and gains.
+        rows: of one cell and stage of the training, tested under several biases and gains.
         heading: title of the figure.
         file: where to.
         algorithm: what the policies are of.
@@ -89,10 +89,11 @@ def plot_disturbances(
         the file, or ``None`` if neither bias nor gain varies.
     """
     found: list[tuple[str, str, list[Row]]] = []
-    for what_acts in dict.fromkeys(map(_acting, rows)):
-        stage, policy, noise = what_acts
+    stage = rows[0].get("stage", "")
+    for policy, noise in dict.fromkeys((row["policy"], row["noise"]) for row in rows):
+        mine = [row for row in rows if (row["policy"], row["noise"]) == (policy, noise)]
         for what, other, neutral in (("bias", "gain", 1.0), ("gain", "bias", 0.0)):
-            chosen = [row for row in rows if _acting(row) == what_acts and row[other] == neutral]
+            chosen = [row for row in mine if row[other] == neutral]
             if len({row[what] for row in chosen}) > 1:
                 name = _panel_title(algorithm.acting(policy, stage), noise)
                 found.append((name, what, chosen))
@@ -120,10 +121,6 @@ def plot_disturbances(
     figure.suptitle(heading, fontsize=11)
     legend_below(figure, axes)
     return save(figure, file)
-
-
-def _acting(row: Row) -> tuple[str, str, str]:
-    return row.get("stage", ""), row["policy"], row["noise"]
 
 
 def _panel_title(actions: str, noise: str) -> str:

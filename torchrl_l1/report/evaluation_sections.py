@@ -45,7 +45,7 @@ def _sim_to_real(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> 
     page.heading(
         "Sim to real",
         "Policies and models trained without noise, frozen and tested with it, L1 off and on"
-        + " (the paper's Table 2)" * algorithm.released
+        + _published(algorithm, "sim_to_real")
         + ": mean ± standard deviation over training seeds, 95 % interval of "
         "the mean; differences are taken policy by policy.",
     )
@@ -56,16 +56,13 @@ def _ablation(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> Non
     page.heading(
         "Ablation",
         "L1 in neither phase, in one of them, or in both"
-        + " (the paper's Table 5 and ablation figure)" * algorithm.released
+        + _published(algorithm, "ablation", " and ablation figure")
         + ": bars are means, dots training seeds, lines 95 % intervals.",
     )
     for l1 in sorted({row["training_l1"] for row in rows} - {BASELINE}):
         mine = [row for row in rows if {row["training_l1"], row["l1"]} <= {BASELINE, l1}]
-        for policy in algorithm.policies:
-            chosen = [row for row in mine if row["policy"] == policy]
-            if chosen:
-                words = _listed(f"L1 {l1}", _actions(algorithm, policy, chosen))
-                page.text(f"{words}:", ablation_table(chosen))
+        for actions, chosen in _by_actions(algorithm, mine):
+            page.text(f"{_listed(f'L1 {l1}', actions)}:", ablation_table(chosen))
         for variant, stage in dict.fromkeys((row["variant"], _stage(row)) for row in mine):
             chosen = [
                 row
@@ -98,9 +95,7 @@ def _tuning(page: Page, algorithm: AlgorithmFacts, name: str, rows: Sequence[Row
     explained = False
     for heading, words, chosen in _training_cells(rows):
         policy, swept = tuning_rows(chosen)
-        acting = algorithm.acting(policy, _stage(chosen[0])).replace(
-            "mean action", "the mean action"
-        )
+        acting = algorithm.acting(policy, _stage(chosen[0]))
         caption = f"{heading}; tested with {acting}" if acting else heading
         file = page.file("sweep", name, *words)
         drawn = plot_tuning(swept, named(page.name, caption), file)
@@ -143,20 +138,26 @@ def _other(name: str) -> Section:
 def _evaluation_tables(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> None:
     """A table per L1 setting of the training and kind of policy."""
     for l1 in dict.fromkeys(row["training_l1"] for row in rows):
-        for policy in algorithm.policies:
-            chosen = [r for r in rows if (r["training_l1"], r["policy"]) == (l1, policy)]
-            if chosen and len(chosen) <= _MOST_ROWS:
-                actions = _actions(algorithm, policy, chosen)
+        mine = [row for row in rows if row["training_l1"] == l1]
+        for actions, chosen in _by_actions(algorithm, mine):
+            if len(chosen) <= _MOST_ROWS:
                 words = _listed(f"Trained with {arm_label(l1)}", actions)
                 swept = any("option" in row for row in chosen)
                 table = tuning_table if swept else evaluation_table
                 page.text(f"{words}:", table(chosen))
 
 
-def _actions(algorithm: AlgorithmFacts, policy: str, rows: Sequence[Row]) -> str:
-    """How policies act that have a choice, in words; nothing where all are planners."""
-    planned = all(algorithm.plans(_stage(row)) for row in rows)
-    return "" if planned else algorithm.policies[policy]
+def _by_actions(algorithm: AlgorithmFacts, rows: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
+    """The rows by how the policies act, in words: those that have no choice first."""
+    groups: dict[str, list[Row]] = {words: [] for words in ("", *algorithm.policies.values())}
+    for row in rows:
+        groups[algorithm.actions(row["policy"], _stage(row))].append(row)
+    yield from ((words, found) for words, found in groups.items() if found)
+
+
+def _published(algorithm: AlgorithmFacts, kind: str, more: str = "") -> str:
+    table = algorithm.tables.get(kind)
+    return f" (the paper's Table {table}{more})" if table else ""
 
 
 def _stage(row: Row) -> str:

@@ -143,7 +143,7 @@ def _published(run: Run, key: Key) -> dict[str, str]:
     l1, noise, bias, gain, policy, _ = key
     what = run.identity
     usual = (bias, gain, policy) == (0.0, 1.0, "stochastic")
-    if not (usual and what.as_published and facts(what.algorithm).released):
+    if not (usual and what.as_published and "sim_to_real" in facts(what.algorithm).tables):
         return {}
     cell = published_cell(what.task, what.noise, what.arm, noise, l1)
     return {} if cell is None else cell.columns()

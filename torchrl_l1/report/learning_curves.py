@@ -45,7 +45,8 @@ def plot_task(
     for noise, lines in _main_lines(study, task):
         heading = named(name, title(task, noise))
         authors = _authors(reference, task, noise)
-        panels.append(Panel(heading, lines, authors, _stages(study, lines)[:-1]))
+        earlier = len(study.facts.stages[:-1])
+        panels.append(Panel(heading, lines, authors, _stages(study, lines)[:earlier]))
     return plot_panels(panels, file)
 
 
@@ -116,7 +117,6 @@ def plot_algorithms(
                 algorithm_label(study.facts.name, cell.arm),
                 algorithm_color(study.algorithm),
                 runs,
-                mean_action=False,
                 style=arm_style(cell.arm, arms),
             )
             for study in studies
@@ -128,7 +128,7 @@ def plot_algorithms(
 
 
 def _line(study: Study, cell: Cell, label: str, shade: str) -> Line:
-    return Line(label, shade, study.cells[cell], mean_action=study.facts.samples)
+    return Line(label, shade, study.cells[cell], mean_action=study.facts.mean_action_stages)
 
 
 def _main_lines(study: Study, task: str) -> Iterator[tuple[str, list[Line]]]:

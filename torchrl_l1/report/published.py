@@ -90,13 +90,11 @@ def published_cell(
         if arm != BASELINE and arm not in _PUBLISHED_ARMS:
             return None
         switches.append("off" if arm == BASELINE else "on")
-    known = facts(algorithm)
     if training_noise == testing_noise and switches[0] == switches[1]:
-        table = known.table
-    elif not known.released:
-        table = ""
+        kind = "training"
     elif training_noise == testing_noise:
-        table = "5"
+        kind = "ablation"
     else:
-        table = "2" if training_noise == "none" else ""
+        kind = "sim_to_real" if training_noise == "none" else ""
+    table = facts(algorithm).tables.get(kind, "")
     return published_cells().get((table, task, testing_noise, switches[0], switches[1]))

@@ -145,10 +145,9 @@ def one_policy(tests: Sequence[Evaluation]) -> list[Evaluation]:
 
 def distinct_policies(tests: Sequence[Evaluation], algorithm: AlgorithmFacts) -> list[Evaluation]:
     """The tests, each once where an algorithm acts in one way only, in all stages or in some."""
-    if not algorithm.samples:
-        return one_policy(tests)
-    planned = [test for test in tests if algorithm.plans(test.stage)]
-    return [*one_policy(planned), *(test for test in tests if not algorithm.plans(test.stage))]
+    single = [test for test in tests if algorithm.acts_in_one_way(test.stage)]
+    both = [test for test in tests if not algorithm.acts_in_one_way(test.stage)]
+    return [*one_policy(single), *both]
 
 
 def _known(value: float) -> float | None:

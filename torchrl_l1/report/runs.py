@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_l1.report.algorithms import MEASURING
+from torchrl_l1.report.algorithms import MEASURING, facts
 from torchrl_l1.report.reading import Evaluation
 from torchrl_l1.report.settings import Identity
-from torchrl_l1.report.statistics import final_return
+from torchrl_l1.report.statistics import WINDOW
 
 __all__ = ["Evaluation", "Run"]
 
@@ -59,18 +59,31 @@ class Run:
         return f"{len(self.returns)} of {self.identity.outer_iterations}"
 
     @property
+    def ending(self) -> np.ndarray:
+        """Indices of the outer iterations that the return is of.
+
+        They are the last three, as in the paper; with several stages, those that the return of
+        the last one is of: no other stage is mixed in.
+        """
+        stages = facts(self.identity.algorithm).stages
+        if self.stage is None or not len(self.stage):
+            return self.end_of(0, WINDOW)
+        last = int(self.stage[-1]) - 1
+        return self.end_of(last, stages[last].window)
+
+    @property
     def final(self) -> float:
-        """Return by the paper's rule: the mean over the last three outer iterations."""
-        return float(final_return(self.returns))
+        """Return by the paper's rule: the mean over :attr:`ending`."""
+        return float(self.returns[self.ending].mean())
 
     @property
     def final_deterministic(self) -> float:
         """The same of the deterministic return."""
-        return float(final_return(self.deterministic))
+        return float(self.deterministic[self.ending].mean())
 
     def final_signal(self, name: str) -> float:
-        """Mean of a signal of L1 over the last three outer iterations; NaN without L1."""
-        return float(final_return(self.signals[name]))
+        """Mean of a signal of L1 over the same outer iterations; NaN without L1."""
+        return float(self.signals[name][self.ending].mean())
 
     def during(self, position: int) -> np.ndarray:
         """Which outer iterations ``(T,)`` belong to a stage, the first being 0."""

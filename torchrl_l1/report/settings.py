@@ -25,7 +25,7 @@ NOISES = ("none", "action", "observation", "both")
 """Noise settings in the order in which tables and figures show them."""
 
 # Keys that tell runs apart in other ways, or that do not touch the result.
-_NOT_COMPARED = (*VOLATILE_KEYS, "seed", "task", "threads", "device", "l1.compile")
+_NOT_COMPARED = (*VOLATILE_KEYS, "seed", "task", "threads", "device", "compile_plans", "l1.compile")
 # Two ways to give the gain of the filter, which is compared under the first of these names.
 _FILTER_KEYS = ("l1.alpha", "l1.cutoff")
 _NOISE_KEYS = ("perturbation.action_noise", "perturbation.observation_noise")
@@ -36,7 +36,8 @@ class Identity:
     """What a run is one sample of.
 
     Attributes:
-        algorithm: ``metrpo``, ``pets``, or ``dets`` for PETS with members that predict points.
+        algorithm: ``metrpo``, ``mbmf``, ``pets``, or ``dets`` for PETS with members that predict
+            points.
         task: such as ``half_cheetah``.
         noise: option of the ``noise`` group that its noise is equal to, else what there is of it
             with its half-width, such as ``action 0.3``.
@@ -73,7 +74,7 @@ class Identity:
     def as_published(self) -> bool:
         """Whether the published tables are of such runs: algorithm, model and controller."""
         affine = self.model_form == "affine"
-        return bool(facts(self.algorithm).table) and not affine and not self.departures
+        return "training" in facts(self.algorithm).tables and not affine and not self.departures
 
 
 def identify(config: Mapping[str, Any]) -> Identity:

@@ -41,7 +41,7 @@ def stage_rows(study: Study) -> list[dict[str, Any]]:
                     {
                         **place_columns(cell),
                         "stage": stage.name,
-                        "policy": "" if stage.plans else policy,
+                        "policy": "" if stage.is_planner else policy,
                         "seeds": len(done),
                         **mean_summary("return", returns),
                         "std": float(np.std(returns)),

@@ -23,7 +23,7 @@ def training_sections(page: Page, study: Study, reference: ReferenceCurves | Non
         study: the runs.
         reference: curves of the authors' logs; left out where they are of another algorithm.
     """
-    if not study.facts.released:
+    if not study.facts.reference_logs:
         reference = None
     _training(page, study, reference)
     _pairs(page, study)
@@ -38,6 +38,7 @@ def _training(page: Page, study: Study, reference: ReferenceCurves | None) -> No
     page.heading(
         "Training",
         "Return is the mean over seeds of the mean over the last three outer iterations"
+        + " (fewer where the last stage has or counts fewer)" * bool(study.facts.stages)
         + ", of sampled actions as in the paper" * study.facts.samples
         + "; the spread is the paper's ± (standard deviation over "
         "seeds in each of these iterations, averaged), the interval that of the mean over seeds. "
@@ -95,9 +96,9 @@ def _curves(page: Page, study: Study, reference: ReferenceCurves | None) -> None
     page.heading(
         "Learning curves",
         "Thin: single seeds; bold: their mean"
-        + "; dashed: mean of the return with the mean action" * study.facts.samples
+        + _dashed(study)
         + "; grey: mean of the authors' logs, where they were given, cut where ours end"
-        * study.facts.released
+        * study.facts.reference_logs
         + _bands(study)
         + ".",
     )
@@ -105,6 +106,13 @@ def _curves(page: Page, study: Study, reference: ReferenceCurves | None) -> None
         file = page.file("learning_curves", task)
         figure = plot_task(study, task, file, reference, page.name)
         page.figure(figure, f"Learning curves, {title(task)}")
+
+
+def _dashed(study: Study) -> str:
+    places = study.facts.mean_action_stages
+    words = [stage.words for place, stage in enumerate(study.facts.stages) if place in places]
+    where = f" in {' and '.join(words)}" if words else ""
+    return f"; dashed: mean of the return with the mean action{where}" if places else ""
 
 
 def _bands(study: Study) -> str:
@@ -122,7 +130,7 @@ def _comparisons(page: Page, study: Study, reference: ReferenceCurves | None) ->
             "The same table for runs that depart from the main ones in these settings, and the "
             "main ones of the same task and noise."
             + " It is the comparison of the paper's Figure 2."
-            * ("model.form" in keys and study.facts.released),
+            * ("model.form" in keys and study.facts.compares_models),
         )
         rows = [
             training_row(cell, study.cells[cell], reference)

@@ -56,7 +56,7 @@ def training_row(
 ) -> dict[str, Any]:
     """A cell: our returns over its finished runs, the paper's, the authors' logged ones.
 
-    The return is the mean over seeds of the mean over the last three outer iterations.
+    The return is the mean over seeds of the mean over :attr:`Run.ending`.
     """
     done = [run for run in runs if run.finished]
     place = (cell.task, cell.noise, cell.arm)
@@ -64,7 +64,9 @@ def training_row(
     if done:
         row |= mean_summary("return", [run.final for run in done])
         if len(done) > 1:
-            row["published_spread"] = published_spread(np.array([run.returns for run in done]))
+            row["published_spread"] = published_spread(
+                np.array([run.returns[run.ending] for run in done])
+            )
         if facts(runs[0].identity.algorithm).samples:
             row |= mean_summary("deterministic", [run.final_deterministic for run in done])
         row["real_steps"] = round(float(np.mean([run.real_steps[-1] for run in done])))
@@ -160,7 +162,7 @@ def mean_summary(name: str, values: Sequence[float]) -> dict[str, Any]:
 
 
 def _signals(runs: Sequence[Run]) -> dict[str, float]:
-    """What L1 did, over the last three iterations; what is known of it."""
+    """What L1 did at the end of the training; what is known of it."""
     values = {
         "switches_per_1000": [1000 * run.final_signal("l1/switch_rate") for run in runs],
         "u_a": [run.final_signal("l1/u_a") for run in runs],
