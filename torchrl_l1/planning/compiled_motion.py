@@ -32,8 +32,8 @@ def resolve_compilation(
 
     On the CPU it becomes ``False``. The eager path takes a block of particles through a member's
     layers while they are in the cache; compiled, all members go through a layer together. In
-    float32 that is slower, in bfloat16 the one is about as fast as the other, and compiling takes
-    some ten seconds of every run.
+    float32 that is slower; in bfloat16 it is somewhat faster, but compiling takes some ten seconds
+    of every run.
 
     Args:
         mode: ``"auto"``, or what is to be returned.
