@@ -193,6 +193,27 @@ def return_metrics(data: TensorDictBase) -> dict[str, float]:
     }
 
 
+def policy_returns(
+    data: TensorDictBase, collected: Collection, measured: Collection, seed: int, iteration: int
+) -> dict[str, float]:
+    """Returns of full episodes: with sampled actions and with the policy's mean action.
+
+    Where the collected episodes are full, they are the ones with sampled actions.
+
+    Args:
+        data: episodes of ``collected``, of the stochastic policy.
+        collected: where they come from.
+        measured: full episodes of the same policy.
+        seed: of the measured episodes' streams.
+        iteration: likewise.
+    """
+    shorter = collected.horizon < measured.horizon
+    full = not shorter and not data["next", "terminated"].any()
+    sampled = data if full else measured.evaluate(seed, iteration, deterministic=False)
+    mean_action = episode_returns(measured.evaluate(seed, iteration, deterministic=True))
+    return {**return_metrics(sampled), "return_deterministic": mean_action.mean().item()}
+
+
 def signal_metrics(data: TensorDictBase) -> dict[str, float]:
     """Non-finite steps, and means and maxima of L1's signals if it is on."""
     metrics: dict[str, float] = {"non_finite_steps": int(data["next", "non_finite"].sum())}

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import replace
-from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -26,6 +25,7 @@ from torchrl_l1.algorithms.cloning import Cloning
 from torchrl_l1.algorithms.collection import (
     Perturbation,
     episode_returns,
+    policy_returns,
     return_metrics,
     signal_metrics,
 )
@@ -159,7 +159,7 @@ class MBMF:
             with self._phase("evaluate", "evaluating"):
                 full = self.real.shooting_measured.evaluate(self.seed, self.iteration)
         return {
-            **_returns(full, full),
+            **_returns(full),
             **signal_metrics(data),
             **fit,
             "plan/promised_return": _finite_mean(data["next", "plan", "best_return"]),
@@ -183,7 +183,7 @@ class MBMF:
         with self._phase("evaluate", "evaluating"):
             measured = self.real.clone_measured.evaluate(self.seed, self.iteration)
         return {
-            **_returns(measured, measured),
+            **_returns(measured),
             **metrics,
             **cloning_metrics(report, len(self.cloning.buffer)),
         }
@@ -200,11 +200,8 @@ class MBMF:
         with self._phase("tune", "PPO"):
             report = self.fine_tuning.step(data, min(done, 1.0))
         with self._phase("evaluate", "evaluating"):
-            evaluate = partial(self.real.policy_measured.evaluate, self.seed, self.iteration)
-            shorter = self.real.practice.horizon < self.real.policy_measured.horizon
-            whole = not shorter and not data["next", "terminated"].any()
-            sampled = data if whole else evaluate(deterministic=False)
-            returns = _returns(sampled, evaluate(deterministic=True))
+            practice, measured = self.real.practice, self.real.policy_measured
+            returns = policy_returns(data, practice, measured, self.seed, self.iteration)
         return {
             **returns,
             **signal_metrics(data),
@@ -297,6 +294,7 @@ def _finite_mean(values: Tensor) -> float:
     return values[values.isfinite()].mean().item()
 
 
-def _returns(sampled: TensorDictBase, mean_action: TensorDictBase) -> dict[str, float]:
-    deterministic = episode_returns(mean_action).mean().item()
-    return {**return_metrics(sampled), "return_deterministic": deterministic}
+def _returns(data: TensorDictBase) -> dict[str, float]:
+    """Returns of what acts in one way only."""
+    deterministic = episode_returns(data).mean().item()
+    return {**return_metrics(data), "return_deterministic": deterministic}

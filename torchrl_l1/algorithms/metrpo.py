@@ -15,15 +15,13 @@ from itertools import pairwise
 from time import perf_counter
 from typing import Any
 
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_l1.algorithms.algorithm import IterationResult
 from torchrl_l1.algorithms.collection import (
     Collection,
     Perturbation,
-    episode_returns,
-    return_metrics,
+    policy_returns,
     signal_metrics,
 )
 from torchrl_l1.algorithms.device import resolve_device
@@ -136,7 +134,9 @@ class METRPO:
             self.learning.store(data)
             clock.append(perf_counter())
             self.on_phase("evaluating")
-            returns = self.evaluate(data)
+            returns = policy_returns(
+                data, self.collection, self.evaluation, self.seed, self.iteration
+            )
             clock.append(perf_counter())
 
             metrics = {
@@ -152,21 +152,6 @@ class METRPO:
             phases = ("random", "fit", "trpo", "collect", "evaluate")
             seconds = [after - before for before, after in pairwise(clock)]
             yield IterationResult(metrics, dict(zip(phases, seconds, strict=True)))
-
-    def evaluate(self, data: TensorDictBase) -> dict[str, float]:
-        """Returns of full episodes: with sampled actions and with the policy's mean action.
-
-        Where the collected episodes are full, they are the ones with sampled actions.
-        """
-        evaluate = partial(self.evaluation.evaluate, self.seed, self.iteration)
-        shorter = self.collection.horizon < self.evaluation.horizon
-        full = not shorter and not data["next", "terminated"].any()
-        sampled = data if full else evaluate(deterministic=False)
-        mean_action = episode_returns(evaluate(deterministic=True))
-        return {
-            **return_metrics(sampled),
-            "return_deterministic": mean_action.mean().item(),
-        }
 
     @property
     def policies(self) -> Mapping[str, TensorDictModuleBase]:
