@@ -9,12 +9,12 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from torchrl_l1.algorithms.mbmf_config import FineTuningConfig
-from torchrl_l1.algorithms.policy import GaussianPolicy
+from torchrl_l1.algorithms.policy import GaussianPolicy, make_actor
 from torchrl_l1.dynamics import Normalizer
 from torchrl_l1.envs import Task
 
@@ -60,7 +60,7 @@ class FineTuning:
             vectorized=False,
         )
         self.loss = ClipPPOLoss(
-            _sampling_actor(policy),
+            make_actor(policy, _SAMPLED, _LOG_PROB),
             critic,
             clip_epsilon=config.clip_epsilon,
             entropy_bonus=config.entropy_coefficient > 0,
@@ -166,15 +166,4 @@ def exploring(policy: GaussianPolicy, task: Task) -> TensorDictModuleBase:
     clip = TensorDictModule(
         lambda sampled: sampled.clamp(low, high), in_keys=[_SAMPLED], out_keys=["action"]
     )
-    return TensorDictSequential(_sampling_actor(policy), clip)
-
-
-def _sampling_actor(policy: GaussianPolicy) -> ProbabilisticActor:
-    return ProbabilisticActor(
-        TensorDictModule(policy, in_keys=["observation"], out_keys=["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        out_keys=[_SAMPLED],
-        distribution_class=IndependentNormal,
-        return_log_prob=True,
-        log_prob_key=_LOG_PROB,
-    )
+    return TensorDictSequential(make_actor(policy, _SAMPLED, _LOG_PROB), clip)

@@ -69,12 +69,20 @@ def _normalized_linear(fan_in: int, fan_out: int, norm: float) -> nn.Linear:
     return layer
 
 
-def make_actor(policy: GaussianPolicy) -> ProbabilisticActor:
-    """TorchRL actor around the policy: ``observation`` to ``loc``, ``scale`` and ``action``."""
+def make_actor(
+    policy: GaussianPolicy, action_key: str = "action", log_prob_key: str | None = None
+) -> ProbabilisticActor:
+    """TorchRL actor around the policy: ``observation`` to ``loc``, ``scale`` and the action.
+
+    With a ``log_prob_key`` it writes the logarithm of the action's density there.
+    """
     return ProbabilisticActor(
         TensorDictModule(policy, in_keys=["observation"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
+        out_keys=[action_key],
         distribution_class=IndependentNormal,
+        return_log_prob=log_prob_key is not None,
+        log_prob_key=log_prob_key,
     )
 
 
