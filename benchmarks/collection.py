@@ -13,8 +13,8 @@ from torchrl.envs import Transform
 from benchmarks.tables import Table
 from benchmarks.timing import Row, interleave, ratio, spread
 from torchrl_l1.algorithms.policy import GaussianPolicy, clipped, make_actor
+from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Transform
-from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, fit_ensemble
 from torchrl_l1.envs import Task, get_task, make_env
 

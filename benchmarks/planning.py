@@ -19,7 +19,7 @@ from benchmarks.peers import Peer, peer
 from benchmarks.tables import Table
 from benchmarks.timing import Row, interleave, ratio, spread
 from torchrl_l1.dynamics import EnsembleDynamics
-from torchrl_l1.dynamics.model_env import EnsembleModelEnv
+from torchrl_l1.dynamics.imagination import EnsembleModelEnv
 from torchrl_l1.planning import CEMConfig, Precision, Propagation, TrajectorySampler, plan_cem
 
 CONFIG = CEMConfig(

@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_l1.algorithms.advantages import imagined_advantages
+from torchrl_l1.algorithms.policy_improvement import imagined_advantages
 
 GAMMA, LAMBDA = 0.9, 0.8
 

@@ -3,16 +3,11 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict
 
-from torchrl_l1.algorithms.collection import (
-    Collection,
-    Perturbation,
-    episode_returns,
-    first_episodes,
-)
+from torchrl_l1.algorithms.collection import Collection, episode_returns, first_episodes
 from torchrl_l1.algorithms.policy import GaussianPolicy, acting
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import EnsembleDynamics
-from torchrl_l1.envs import get_task
+from torchrl_l1.envs import Perturbation, get_task
 
 
 def test_returns_are_those_of_first_episodes() -> None:

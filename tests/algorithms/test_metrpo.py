@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from torchrl_l1.algorithms import METRPO, METRPOConfig, Perturbation
+from torchrl_l1.algorithms.config import ModelConfig
 from torchrl_l1.algorithms.metrpo_config import PolicyConfig
 from torchrl_l1.algorithms.metrpo_metrics import METRICS
-from torchrl_l1.algorithms.model_config import ModelConfig
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.objectives import TRPOConfig

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from torchrl_l1.algorithms import PETS, PETSConfig
-from torchrl_l1.algorithms.model_config import ModelConfig
+from torchrl_l1.algorithms.config import ModelConfig
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.planning import CEMConfig

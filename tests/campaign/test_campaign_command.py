@@ -20,13 +20,11 @@ import pytest
 from omegaconf import OmegaConf
 
 from torchrl_l1.campaign import child, jobs, progress
-from torchrl_l1.campaign.description import read_campaign
+from torchrl_l1.campaign.description import dump_yaml, load_yaml, read_campaign
 from torchrl_l1.campaign.evaluation import evaluate_run, is_evaluated
-from torchrl_l1.campaign.launcher import sweep
-from torchrl_l1.campaign.plan import plan
+from torchrl_l1.campaign.jobs import sweep
+from torchrl_l1.campaign.plan import PlannedRun, plan
 from torchrl_l1.campaign.progress import overview
-from torchrl_l1.campaign.runs import PlannedRun
-from torchrl_l1.campaign.yaml_file import dump_yaml, load_yaml
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError

@@ -12,12 +12,15 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from torchrl_l1.campaign.description import read_campaign
-from torchrl_l1.campaign.launcher import LAUNCHERS, check_launcher, sweep
-from torchrl_l1.campaign.plan import check_devices, plan
-from torchrl_l1.campaign.runs import PlannedRun
-from torchrl_l1.campaign.settings import CampaignError, RunMatrix
-from torchrl_l1.campaign.yaml_file import dump_yaml, load_yaml
+from torchrl_l1.campaign.description import (
+    CampaignError,
+    RunMatrix,
+    dump_yaml,
+    load_yaml,
+    read_campaign,
+)
+from torchrl_l1.campaign.jobs import LAUNCHERS, check_launcher, sweep
+from torchrl_l1.campaign.plan import PlannedRun, check_devices, plan
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.recipes import RecipeError, available_campaigns, available_recipes
 from torchrl_l1.experiment.settings import L1Settings, l1_config
@@ -239,7 +242,7 @@ def test_launcher_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch
     def nothing(name: str) -> None:
         raise ModuleNotFoundError(name)
 
-    monkeypatch.setattr("torchrl_l1.campaign.launcher.find_spec", nothing)
+    monkeypatch.setattr("torchrl_l1.campaign.jobs.find_spec", nothing)
     with pytest.raises(CampaignError, match=r"pip install 'torchrl-l1\[submitit\]'"):
         check_launcher("submitit_slurm")
     check_launcher("basic")

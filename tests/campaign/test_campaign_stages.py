@@ -10,12 +10,15 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from torchrl_l1.campaign.description import read_campaign
+from torchrl_l1.campaign.description import (
+    CampaignError,
+    EvaluationSettings,
+    dump_yaml,
+    load_yaml,
+    read_campaign,
+)
 from torchrl_l1.campaign.evaluation import evaluate_run, is_evaluated
-from torchrl_l1.campaign.plan import plan
-from torchrl_l1.campaign.runs import PlannedRun
-from torchrl_l1.campaign.settings import CampaignError, EvaluationSettings
-from torchrl_l1.campaign.yaml_file import dump_yaml, load_yaml
+from torchrl_l1.campaign.plan import PlannedRun, plan
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.run import run

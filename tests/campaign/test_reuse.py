@@ -13,13 +13,10 @@ import pytest
 from omegaconf import OmegaConf
 
 from torchrl_l1.campaign import reuse
-from torchrl_l1.campaign.description import read_campaign
+from torchrl_l1.campaign.description import CampaignError, dump_yaml, read_campaign
 from torchrl_l1.campaign.evaluation import evaluate_run, is_evaluated
-from torchrl_l1.campaign.plan import plan
+from torchrl_l1.campaign.plan import PlannedRun, plan
 from torchrl_l1.campaign.reuse import copy_run, find_reusable
-from torchrl_l1.campaign.runs import PlannedRun
-from torchrl_l1.campaign.settings import CampaignError
-from torchrl_l1.campaign.yaml_file import dump_yaml
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.run_directory import RunDirectory

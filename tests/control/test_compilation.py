@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch._dynamo.exc import FailOnRecompileLimitHit, TorchDynamoException
 
+from torchrl_l1.compilation import compiled
 from torchrl_l1.control import ActionJacobian, L1Config, augment, init
-from torchrl_l1.control.compilation import compiled
-from torchrl_l1.control.faces import make_step
+from torchrl_l1.control.layout import make_step
 from torchrl_l1.dynamics import EnsembleDynamics
 
 HEADERS = Path(sysconfig.get_path("include")) / "Python.h"

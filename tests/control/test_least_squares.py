@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchrl_l1.control.least_squares import solve_matched
+from torchrl_l1.control.law import solve_matched
 
 DTYPES = [torch.float32, torch.float64]
 

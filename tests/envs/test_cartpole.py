@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_l1.envs import TASKS, BatchedMujocoEnv, make_env
-from torchrl_l1.experiment.rendering import RenderingUnavailable, rollout_frames
+from torchrl_l1.envs.rendering import RenderingUnavailable, rollout_frames
 
 TASK = TASKS["cartpole"]
 DENSITY, GRAVITY, DAMPING, GEAR = 1000.0, 9.81, 1.0, 100.0

@@ -9,8 +9,8 @@ import pytest
 from omegaconf import DictConfig
 
 from torchrl_l1.cli import main
+from torchrl_l1.cli.robustness import summarize, table
 from torchrl_l1.experiment.evaluate import Condition, conditions, evaluate, load_run
-from torchrl_l1.experiment.robustness import summarize, table
 from torchrl_l1.experiment.run import run
 
 Recipe = Callable[..., DictConfig]

@@ -7,7 +7,7 @@ from omegaconf import OmegaConf
 from torchrl_l1.dynamics import ControlAffineDynamics, EnsembleDynamics
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import available_recipes
-from torchrl_l1.experiment.schema import METRPORecipe
+from torchrl_l1.experiment.settings import METRPORecipe
 
 
 def typed(name: str, *overrides: str) -> METRPORecipe:

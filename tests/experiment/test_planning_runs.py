@@ -12,9 +12,8 @@ import torch
 from omegaconf import DictConfig
 
 from torchrl_l1.algorithms.pets import METRICS
-from torchrl_l1.campaign.description import read_campaign
+from torchrl_l1.campaign.description import dump_yaml, read_campaign
 from torchrl_l1.campaign.plan import plan
-from torchrl_l1.campaign.yaml_file import dump_yaml
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.evaluate import conditions, evaluate, load_run
 from torchrl_l1.experiment.launch import compose

@@ -10,8 +10,13 @@ from torchrl_l1.control import L1Config
 from torchrl_l1.envs import get_task
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import RecipeError, available_recipes, find_recipe
-from torchrl_l1.experiment.schema import METRPORecipe, PETSRecipe, schema_of
-from torchrl_l1.experiment.settings import RunSettings, l1_config
+from torchrl_l1.experiment.settings import (
+    METRPORecipe,
+    PETSRecipe,
+    RunSettings,
+    l1_config,
+    schema_of,
+)
 
 RUN_DIR = "run_dir=unused"
 

@@ -12,12 +12,12 @@ import matplotlib.image
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_l1.cli import evaluate as evaluate_command
 from torchrl_l1.cli import main
-from torchrl_l1.experiment import evaluate_command, filmstrip
 from torchrl_l1.experiment.evaluate import Condition, TrainedRun, evaluate, load_run
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.schema import SCHEMAS
+from torchrl_l1.experiment.settings import SCHEMAS
 from torchrl_l1.experiment.stages import KINDS, STAGES, kinds_of
 
 TINY = [
@@ -173,9 +173,9 @@ def test_filmstrip_has_a_row_for_each_stage_and_controller(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown: list[str] = []
-    monkeypatch.setattr(filmstrip, "rollout_frames", lambda task, poses: [poses])
-    monkeypatch.setattr(filmstrip, "filmstrip", lambda rows, *_, **__: shown.extend(rows))
-    monkeypatch.setattr(filmstrip, "animation", lambda *_, **__: None)
+    monkeypatch.setattr(evaluate_command, "rollout_frames", lambda task, poses: [poses])
+    monkeypatch.setattr(evaluate_command, "filmstrip", lambda rows, *_, **__: shown.extend(rows))
+    monkeypatch.setattr(evaluate_command, "animation", lambda *_, **__: None)
     command = ["evaluate", str(trained), "--episodes", "1", "--filmstrip", "--output"]
     main([*command, str(tmp_path / "two"), "--stage", "shooting", "cloning"])
     assert shown == [

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_l1.experiment.versions import commit
+from torchrl_l1.experiment.run_directory import commit
 
 
 def test_commit_of_a_checkout_and_whether_it_was_changed(tmp_path: Path) -> None:

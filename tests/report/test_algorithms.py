@@ -15,7 +15,7 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.stats import ttest_1samp
 
-from torchrl_l1.experiment.schema import SCHEMAS
+from torchrl_l1.experiment.settings import SCHEMAS
 from torchrl_l1.experiment.stages import STAGES
 from torchrl_l1.report import Study, curve_panels, report
 from torchrl_l1.report.algorithm_tables import (

@@ -10,8 +10,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from torchrl_l1.campaign.description import read_campaign
-from torchrl_l1.campaign.yaml_file import dump_yaml
+from torchrl_l1.campaign.description import dump_yaml, read_campaign
 from torchrl_l1.cli import main
 from torchrl_l1.report import report
 

@@ -1,6 +1,6 @@
 """Model-based reinforcement learning algorithms, one readable loop each."""
 
-from torchrl_l1.algorithms.collection import Perturbation
+from torchrl_l1.algorithms.config import ModelConfig
 from torchrl_l1.algorithms.mbmf import MBMF
 from torchrl_l1.algorithms.mbmf_config import (
     ClonedPolicyConfig,
@@ -10,9 +10,9 @@ from torchrl_l1.algorithms.mbmf_config import (
 )
 from torchrl_l1.algorithms.metrpo import METRPO
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig, PolicyConfig
-from torchrl_l1.algorithms.model_config import ModelConfig
 from torchrl_l1.algorithms.pets import PETS
 from torchrl_l1.algorithms.pets_config import PETSConfig
+from torchrl_l1.envs import Perturbation
 
 __all__ = [
     "MBMF",

@@ -2,14 +2,49 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import torch
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.envs import Task
+
+DEVICES = ("cpu", "cuda", "auto")
+"""Where models may be fitted and trajectories imagined."""
+
+
+def resolve_device(name: str) -> torch.device:
+    """``auto`` is CUDA where there is one; a device that is not there is a ``ValueError``."""
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name not in DEVICES:
+        raise ValueError(f"device must be {' or '.join(DEVICES)}, got {name!r}")
+    device = torch.device(name)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError("device=cuda was asked for, but torch finds no CUDA device; use cpu")
+    return device
+
+
+def stream_seed(seed: int, *names: str | int) -> int:
+    """A 63-bit seed for the stream of that name.
+
+    Examples:
+        >>> stream_seed(0, "iteration", 3) == stream_seed(0, "iteration", 3)
+        True
+        >>> stream_seed(0, "iteration", 3) == stream_seed(0, "iteration", 4)
+        False
+    """
+    digest = hashlib.sha256(repr((seed, *names)).encode()).digest()
+    return int.from_bytes(digest[:8], "big") >> 1
+
+
+def seed_streams(seed: int, *names: str | int) -> None:
+    """Start torch's global generator on the stream of that name."""
+    torch.manual_seed(stream_seed(seed, *names))
 
 
 @dataclass

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property, partial
 
 import torch
@@ -16,11 +14,11 @@ from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase, RewardSum, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_type
 
-from torchrl_l1.algorithms.seeding import seed_streams, stream_seed
+from torchrl_l1.algorithms.algorithm import seed_streams, stream_seed
+from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config, L1Transform
-from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.dynamics import EnsembleDynamics
-from torchrl_l1.envs import Task, make_env
+from torchrl_l1.envs import Perturbation, Task, make_env
 
 _L1_MEANS = {
     "switch": "switch_rate",
@@ -28,35 +26,6 @@ _L1_MEANS = {
     "ill_conditioned": "ill_conditioned",
 }
 _L1_MEANS_AND_MAXIMA = ("affinization_error", "prediction_error", "matched", "unmatched", "u_a")
-
-
-@dataclass
-class Perturbation:
-    """What the real environment does that the model is not told.
-
-    Attributes:
-        action_noise: half-width of uniform noise on the executed action, action units.
-        observation_noise: half-width of uniform noise on the observation, raw state units.
-        actuator_bias: constant added to the executed action, action units.
-        actuator_gain: factor on the executed action.
-    """
-
-    action_noise: float = 0.0
-    observation_noise: float = 0.0
-    actuator_bias: float = 0.0
-    actuator_gain: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Refuse settings that could only fail later.
-
-        Raises:
-            ValueError: naming the setting.
-        """
-        for name, value in vars(self).items():
-            if not math.isfinite(value):
-                raise ValueError(f"perturbation.{name} must be finite, got {value}")
-            if name.endswith("_noise") and value < 0:
-                raise ValueError(f"perturbation.{name} must not be negative, got {value}")
 
 
 def make_pipeline(

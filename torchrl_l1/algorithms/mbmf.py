@@ -20,16 +20,14 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_l1.algorithms.algorithm import IterationResult
+from torchrl_l1.algorithms.algorithm import IterationResult, resolve_device, seed_streams
 from torchrl_l1.algorithms.cloning import Cloning
 from torchrl_l1.algorithms.collection import (
-    Perturbation,
     episode_returns,
     policy_returns,
     return_metrics,
     signal_metrics,
 )
-from torchrl_l1.algorithms.device import resolve_device
 from torchrl_l1.algorithms.fine_tuning import FineTuning
 from torchrl_l1.algorithms.mbmf_config import MBMFConfig
 from torchrl_l1.algorithms.mbmf_environments import StageEnvironments
@@ -37,11 +35,10 @@ from torchrl_l1.algorithms.mbmf_metrics import STAGES, cloning_metrics, fine_tun
 from torchrl_l1.algorithms.metrics import fit_metrics
 from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.policy import GaussianPolicy
-from torchrl_l1.algorithms.seeding import seed_streams
+from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config
-from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.dynamics import make_dynamics
-from torchrl_l1.envs import get_task
+from torchrl_l1.envs import Perturbation, get_task
 from torchrl_l1.planning import ModelPredictiveController, ShootingConfig, TrajectorySampler
 
 _PHASES = ("random", "fit", "clone", "tune", "collect", "evaluate")

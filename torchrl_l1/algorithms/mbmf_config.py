@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from torchrl_l1.algorithms.checks import (
+from torchrl_l1.algorithms.config import (
+    ModelConfig,
     check_choice,
     check_counts,
     check_plans,
@@ -13,7 +14,6 @@ from torchrl_l1.algorithms.checks import (
     check_steps,
     check_widths,
 )
-from torchrl_l1.algorithms.model_config import ModelConfig
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.planning import ShootingConfig
 
@@ -29,11 +29,6 @@ class ClonedPolicyConfig:
     hidden: list[int] = field(default_factory=lambda: [64, 64])
 
     def __post_init__(self) -> None:
-        """Refuse settings that could only fail later.
-
-        Raises:
-            ValueError: naming the setting.
-        """
         check_widths("policy.hidden", self.hidden)
 
 
@@ -67,11 +62,6 @@ class CloningConfig:
     validation_fraction: float = 0.1
 
     def __post_init__(self) -> None:
-        """Refuse settings that could only fail later.
-
-        Raises:
-            ValueError: naming the setting.
-        """
         counts = ("iterations", "episodes", "batch_size", "max_epochs", "patience")
         check_counts(self, *counts, prefix="cloning.")
         check_positive("cloning.std", self.std)
@@ -123,11 +113,6 @@ class FineTuningConfig:
     max_gradient_norm: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse settings that could only fail later.
-
-        Raises:
-            ValueError: naming the setting.
-        """
         counts = ("episodes", "epochs", "value_epochs", "minibatches")
         check_counts(self, *counts, prefix="fine_tuning.")
         check_widths("fine_tuning.value_hidden", self.value_hidden)
@@ -212,11 +197,6 @@ class MBMFConfig:
     fine_tuning: FineTuningConfig = field(default_factory=FineTuningConfig)
 
     def __post_init__(self) -> None:
-        """Refuse settings that could only fail later.
-
-        Raises:
-            ValueError: naming the setting.
-        """
         check_choice("label", self.label, ("nominal", "executed"))
         check_counts(
             self,

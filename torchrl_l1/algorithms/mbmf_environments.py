@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from functools import partial
 
-from torchrl_l1.algorithms.collection import Collection, Perturbation
+from torchrl_l1.algorithms.collection import Collection
 from torchrl_l1.algorithms.fine_tuning import exploring
 from torchrl_l1.algorithms.mbmf_config import MBMFConfig
 from torchrl_l1.algorithms.policy import GaussianPolicy, acting
+from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config
-from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.dynamics import EnsembleDynamics
-from torchrl_l1.envs import Task
+from torchrl_l1.envs import Perturbation, Task
 from torchrl_l1.planning import ModelPredictiveController
 
 

@@ -17,25 +17,18 @@ from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 
-from torchrl_l1.algorithms.algorithm import IterationResult
-from torchrl_l1.algorithms.collection import (
-    Collection,
-    Perturbation,
-    policy_returns,
-    signal_metrics,
-)
-from torchrl_l1.algorithms.device import resolve_device
+from torchrl_l1.algorithms.algorithm import IterationResult, resolve_device, seed_streams
+from torchrl_l1.algorithms.collection import Collection, policy_returns, signal_metrics
 from torchrl_l1.algorithms.metrics import fit_metrics
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig, check_clipping
 from torchrl_l1.algorithms.metrpo_metrics import policy_metrics
 from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.policy import GaussianPolicy, acting
 from torchrl_l1.algorithms.policy_improvement import PolicyImprovement
-from torchrl_l1.algorithms.seeding import seed_streams
+from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config
-from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.dynamics import make_dynamics
-from torchrl_l1.envs import get_task
+from torchrl_l1.envs import Perturbation, get_task
 
 
 class METRPO:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from torchrl_l1.algorithms.checks import (
+from torchrl_l1.algorithms.config import (
+    ModelConfig,
     check_choice,
     check_counts,
     check_positive,
     check_steps,
     check_widths,
 )
-from torchrl_l1.algorithms.model_config import ModelConfig
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.objectives import TRPOConfig
 
@@ -34,11 +34,6 @@ class PolicyConfig:
     normalize: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse settings that could only fail later.
-
-        Raises:
-            ValueError: naming the setting.
-        """
         check_widths("policy.hidden", self.hidden)
         check_positive("policy.std", self.std)
 
@@ -105,11 +100,6 @@ class METRPOConfig:
     trpo: TRPOConfig = field(default_factory=TRPOConfig)
 
     def __post_init__(self) -> None:
-        """Refuse settings that could only fail later.
-
-        Raises:
-            ValueError: naming the setting.
-        """
         check_choice("label", self.label, ("nominal", "executed"))
         check_choice("box_exit", self.box_exit, ("truncate", "fail"))
         check_steps("episode_steps", self.episode_steps)

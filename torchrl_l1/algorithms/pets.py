@@ -19,23 +19,20 @@ from typing import Any
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from torchrl_l1.algorithms.algorithm import IterationResult
+from torchrl_l1.algorithms.algorithm import IterationResult, resolve_device, seed_streams
 from torchrl_l1.algorithms.collection import (
     Collection,
-    Perturbation,
     episode_returns,
     return_metrics,
     signal_metrics,
 )
-from torchrl_l1.algorithms.device import resolve_device
 from torchrl_l1.algorithms.metrics import COMMON, L1, fit_metrics
 from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.pets_config import PETSConfig
-from torchrl_l1.algorithms.seeding import seed_streams
+from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config
-from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.dynamics import make_dynamics
-from torchrl_l1.envs import get_task
+from torchrl_l1.envs import Perturbation, get_task
 from torchrl_l1.planning import ModelPredictiveController, TrajectorySampler
 
 METRICS: dict[str, str] = {

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from torchrl_l1.algorithms.checks import check_choice, check_counts, check_plans, check_steps
-from torchrl_l1.algorithms.model_config import ModelConfig
+from torchrl_l1.algorithms.config import (
+    ModelConfig,
+    check_choice,
+    check_counts,
+    check_plans,
+    check_steps,
+)
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.planning import CEMConfig
 
@@ -65,11 +70,6 @@ class PETSConfig:
     fit: FitConfig = field(default_factory=FitConfig)
 
     def __post_init__(self) -> None:
-        """Refuse settings that could only fail later.
-
-        Raises:
-            ValueError: naming the setting.
-        """
         check_choice("label", self.label, ("nominal", "executed"))
         counts = ("outer_iterations", "random_episodes", "episodes_per_iteration", "fit_every")
         check_counts(self, *counts)

@@ -58,7 +58,7 @@ def train(settings: Mapping[str, Any]) -> None:
     from torchrl_l1.experiment.errors import USER_ERRORS, message
     from torchrl_l1.experiment.run import run
     from torchrl_l1.experiment.run_directory import RunDirectoryInUse
-    from torchrl_l1.experiment.schema import schema_of
+    from torchrl_l1.experiment.settings import schema_of
 
     config = OmegaConf.merge(OmegaConf.structured(schema_of(settings)), dict(settings))
     assert isinstance(config, DictConfig)

@@ -9,15 +9,19 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from torchrl_l1.campaign.description import read_campaign
-from torchrl_l1.campaign.jobs import launch_runs, work_on_runs
-from torchrl_l1.campaign.launcher import check_launcher, elsewhere
+from torchrl_l1.campaign.description import (
+    Campaign,
+    CampaignError,
+    dump_yaml,
+    load_yaml,
+    override_key,
+    read_campaign,
+)
+from torchrl_l1.campaign.jobs import check_launcher, elsewhere, launch_runs, work_on_runs
 from torchrl_l1.campaign.plan import check_devices, plan
 from torchrl_l1.campaign.progress import overview
 from torchrl_l1.campaign.reuse import copy_run, find_reusable
-from torchrl_l1.campaign.settings import Campaign, CampaignError, override_key
 from torchrl_l1.campaign.workers import Stopped, available_cores
-from torchrl_l1.campaign.yaml_file import dump_yaml, load_yaml
 from torchrl_l1.experiment.run_directory import write_atomically
 
 

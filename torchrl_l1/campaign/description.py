@@ -1,22 +1,272 @@
-"""Reading a campaign file, with messages that say where a mistake is."""
+"""What a campaign is made of, and reading it from a YAML file."""
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar
 
-from torchrl_l1.campaign.settings import (
-    Campaign,
-    CampaignError,
-    EvaluationSettings,
-    RunMatrix,
-    override_key,
-)
-from torchrl_l1.campaign.yaml_file import load_yaml
+import yaml  # type: ignore[import-untyped]
+
+from torchrl_l1.experiment.l1_options import check_tuning
 from torchrl_l1.experiment.recipes import find_campaign
+from torchrl_l1.experiment.stages import KINDS
+
+
+class _Loader(yaml.SafeLoader):
+    """The safe loader, with Hydra's idea of what a boolean is."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Refuse a key that stands twice: one of them would be lost without a word."""
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key.value!r} stands twice", key.start_mark
+                )
+            seen.add(key.value)
+        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
+        return mapping
+
+
+# YAML 1.1 takes yes, no, on and off for booleans, l1: [off, paper] for [False, 'paper'], and
+# 1e-3 for a word.
+_BOOL, _FLOAT = "tag:yaml.org,2002:bool", "tag:yaml.org,2002:float"
+_Loader.yaml_implicit_resolvers = {
+    letter: [entry for entry in entries if entry[0] not in (_BOOL, _FLOAT)]
+    for letter, entries in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver(_BOOL, re.compile(r"^(?:true|false)$", re.IGNORECASE), list("tTfF"))
+_FLOAT_WORDS = re.compile(
+    r"^[-+]?(?:\d+(?:\.\d*|(?=[eE]))|\.\d+)(?:[eE][-+]?\d+)?$|^[-+]?\.inf$|^\.nan$"
+)
+_Loader.add_implicit_resolver(_FLOAT, _FLOAT_WORDS, list("-+.0123456789"))
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes the words that either kind of loader would take for something else."""
+
+
+_Dumper.add_implicit_resolver(_FLOAT, _FLOAT_WORDS, list("-+.0123456789"))
+
+
+def load_yaml(file: Path) -> Any:
+    """The content of a YAML file.
+
+    Raises:
+        ValueError: if it cannot be read as YAML, with the place.
+    """
+    try:
+        with file.open(encoding="utf-8") as handle:
+            return yaml.load(handle, _Loader)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{file} is not valid YAML: {error}") from error
+
+
+def dump_yaml(content: Any) -> str:
+    """YAML of plain lists, dictionaries and values, keys in their order.
+
+    Examples:
+        >>> print(dump_yaml({"l1": ["off", "paper"]}), end="")
+        l1:
+        - 'off'
+        - paper
+    """
+    return str(yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True))
+
+
+# What may become part of a path and of a Hydra override without quotes.
+_PLAIN = re.compile(r"[A-Za-z0-9_.+-]+")
+_RESERVED = ("run_dir", "resume")
+
+
+class CampaignError(ValueError):
+    """A campaign cannot be run as asked; the message says where the fault lies."""
+
+
+@dataclass
+class RunMatrix:
+    """Runs of one recipe: every combination of the matrix' values.
+
+    Attributes:
+        recipe: a shipped recipe, or a YAML file of the user's, found from the campaign file.
+        overrides: Hydra overrides for all of these runs.
+        matrix: values by key; a key is a recipe group or a setting. ``seed`` is ``[0]`` if absent.
+    """
+
+    recipe: str
+    overrides: list[str] = field(default_factory=list)
+    matrix: dict[str, list[Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _check_list("overrides", self.overrides, str)
+        if not isinstance(self.matrix, dict):
+            raise CampaignError(f"matrix must map keys to lists of values, got {self.matrix!r}")
+        for key, values in self.matrix.items():
+            _check_list(f"matrix.{key}", values, (str, int, float), filled=True)
+            texts = [value_text(value) for value in values]
+            for text in texts:
+                if not _PLAIN.fullmatch(text):
+                    raise CampaignError(
+                        f"matrix.{key}: {text!r} cannot name a folder; give a word or a number, "
+                        "and move what all runs share to overrides"
+                    )
+            if len(set(texts)) < len(texts):
+                raise CampaignError(f"matrix.{key} names a value twice: {', '.join(texts)}")
+        for key in [*self.matrix, *map(override_key, self.overrides)]:
+            if key in _RESERVED:
+                raise CampaignError(f"{key} is set by the campaign itself; leave it out")
+        for key in map(override_key, self.overrides):
+            if key in self.matrix:
+                raise CampaignError(
+                    f"{key} is set by overrides and by the matrix; leave one of them out"
+                )
+        seeds = {"seed": self.matrix.get("seed", [0])}
+        self.matrix = {k: v for k, v in self.matrix.items() if k != "seed"} | seeds
+
+
+@dataclass
+class EvaluationSettings:
+    """An evaluation of frozen policies, for each finished run that matches.
+
+    Attributes:
+        name: of the table ``RUN_DIR/evaluations/NAME.csv``.
+        where: values that a run must have, by matrix key (or ``recipe``); no key, every run.
+        l1: settings of the ``l1`` group.
+        noise: settings of the ``noise`` group.
+        bias: actuator biases, action units.
+        gain: actuator gains.
+        policy: ``stochastic`` and ``deterministic``; a planner, which acts in one way only, is
+            tested once.
+        episodes: episodes per cell.
+        seed: seed of resets, noise and sampled actions.
+        epsilon: tolerances of the switching law, raw state units, as a number or a list; the
+            run's own if null.
+        alpha: gains of the filter per step, as a number or a list; the controller's own if null.
+        stage: stages of the algorithm whose policies are tested; the last one if empty.
+    """
+
+    name: str
+    where: dict[str, list[Any]] = field(default_factory=dict)
+    l1: list[str] = field(default_factory=lambda: ["off", "paper"])
+    noise: list[str] = field(default_factory=lambda: ["none"])
+    bias: list[float] = field(default_factory=lambda: [0.0])
+    gain: list[float] = field(default_factory=lambda: [1.0])
+    policy: list[str] = field(default_factory=lambda: list(KINDS))
+    episodes: int = 25
+    seed: int = 0
+    epsilon: list[float] = field(default_factory=list)
+    alpha: list[float] = field(default_factory=list)
+    stage: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not _PLAIN.fullmatch(self.name):
+            raise CampaignError(f"name must be a word, got {self.name!r}")
+        if not isinstance(self.where, dict):
+            raise CampaignError(f"where must map keys to lists of values, got {self.where!r}")
+        for key, values in self.where.items():
+            _check_list(f"where.{key}", values, (str, int, float), filled=True)
+        for key in ("l1", "noise", "policy"):
+            _check_list(key, getattr(self, key), str, filled=True)
+        _check_list("stage", self.stage, str)
+        for key in ("bias", "gain"):
+            _check_list(key, getattr(self, key), (int, float), filled=True)
+            setattr(self, key, [float(value) for value in getattr(self, key)])
+            if not all(map(math.isfinite, getattr(self, key))):
+                raise CampaignError(f"{key} must be finite, got {getattr(self, key)}")
+        unknown = [policy for policy in self.policy if policy not in KINDS]
+        if unknown:
+            raise CampaignError(f"unknown policy {unknown[0]!r}; there are {', '.join(KINDS)}")
+        for key, least in (("episodes", 1), ("seed", 0)):
+            value = getattr(self, key)
+            if not isinstance(value, int) or isinstance(value, bool) or value < least:
+                raise CampaignError(f"{key} must be a whole number from {least}, got {value!r}")
+        self.epsilon = _numbers("epsilon", self.epsilon)
+        self.alpha = _numbers("alpha", self.alpha)
+        try:
+            check_tuning(self.epsilon, self.alpha)
+        except ValueError as error:
+            raise CampaignError(str(error)) from error
+
+    def of_a_run(self) -> dict[str, Any]:
+        """What the table of a single run depends on: all settings but ``name`` and ``where``."""
+        settings = asdict(self)
+        del settings["name"], settings["where"]
+        return settings
+
+
+@dataclass
+class Campaign:
+    """A campaign file, read and checked.
+
+    Attributes:
+        name: the name of the campaign.
+        file: where it was read from.
+        description: one line.
+        runs: matrices of runs.
+        evaluations: evaluations of the finished runs.
+    """
+
+    name: str
+    file: Path
+    description: str
+    runs: list[RunMatrix]
+    evaluations: list[EvaluationSettings]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The resolved campaign as plain lists and dictionaries."""
+        whole = asdict(self)
+        del whole["file"]
+        return whole
+
+
+def value_text(value: Any) -> str:
+    """A value as Hydra writes and reads it.
+
+    Examples:
+        >>> [value_text(value) for value in ("off", 3, 0.5, True)]
+        ['off', '3', '0.5', 'true']
+    """
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def override_key(override: str) -> str:
+    """The key of a Hydra override.
+
+    Raises:
+        CampaignError: if it has none.
+
+    Examples:
+        >>> override_key("+l1.epsilon=0.5")
+        'l1.epsilon'
+    """
+    key, equals, _ = override.partition("=")
+    if not equals or not key.strip("+~"):
+        raise CampaignError(f"{override!r} is not an override; write KEY=VALUE")
+    return key.strip("+~").partition("@")[0]
+
+
+def _numbers(key: str, value: Any) -> list[float]:
+    """Null, a number or a list of numbers as a list."""
+    values = [] if value is None else value if isinstance(value, list) else [value]
+    if any(isinstance(one, bool) or not isinstance(one, (int, float)) for one in values):
+        raise CampaignError(f"{key} must be null, a number or a list of numbers, got {value!r}")
+    return [float(one) for one in values]
+
+
+def _check_list(
+    key: str, values: Any, kinds: type | tuple[type, ...], filled: bool = False
+) -> None:
+    if not isinstance(values, list) or (filled and not values):
+        raise CampaignError(f"{key} must be a list{' of values' * filled}, got {values!r}")
+    for value in values:
+        if not isinstance(value, kinds):
+            raise CampaignError(f"{key} holds {value!r}, which is no plain value of its kind")
+
 
 T = TypeVar("T")
 

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrl_l1.campaign.settings import EvaluationSettings
-from torchrl_l1.campaign.yaml_file import dump_yaml, load_yaml
+from torchrl_l1.campaign.description import EvaluationSettings, dump_yaml, load_yaml
 from torchrl_l1.experiment.evaluate import conditions, distinct, evaluate, load_run
 from torchrl_l1.experiment.run_directory import RunDirectory, write_atomically, write_table
 

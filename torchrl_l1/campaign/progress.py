@@ -11,7 +11,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from torchrl_l1.campaign.evaluation import is_evaluated
-from torchrl_l1.campaign.runs import PlannedRun
+from torchrl_l1.campaign.plan import PlannedRun
 
 REFRESH_SECONDS = 2.0
 

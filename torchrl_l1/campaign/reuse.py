@@ -10,10 +10,15 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from torchrl_l1.campaign.runs import PlannedRun
-from torchrl_l1.campaign.settings import CampaignError
-from torchrl_l1.experiment.finding import read_config, run_directories
-from torchrl_l1.experiment.run_directory import RunDirectory, differences, write_atomically
+from torchrl_l1.campaign.description import CampaignError
+from torchrl_l1.campaign.plan import PlannedRun
+from torchrl_l1.experiment.run_directory import (
+    RunDirectory,
+    differences,
+    read_config,
+    run_directories,
+    write_atomically,
+)
 
 
 def find_reusable(

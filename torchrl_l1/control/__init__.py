@@ -8,14 +8,14 @@ from torchrl_l1.control.affine import (
     AffineModel,
     Affinization,
     affinize,
+    augment,
     switching_law,
 )
 from torchrl_l1.control.affinizer import Affinizer
-from torchrl_l1.control.augmentation import augment
+from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.controller import L1Controller
 from torchrl_l1.control.jacobian import ActionJacobian, DynamicsModel
-from torchrl_l1.control.law import L1Config, L1Diagnostics, L1State, init, step
-from torchrl_l1.control.least_squares import solve_matched
+from torchrl_l1.control.law import L1Diagnostics, L1State, init, solve_matched, step
 from torchrl_l1.control.transform import L1Transform
 
 __all__ = [

@@ -11,17 +11,19 @@ from tensordict.utils import NestedKey
 from torchrl.data import Composite
 from torchrl.envs.transforms import TensorDictPrimer
 
-from torchrl_l1.control.compilation import CompileMode
-from torchrl_l1.control.faces import (
+from torchrl_l1.compilation import CompileMode
+from torchrl_l1.control.config import L1Config
+from torchrl_l1.control.jacobian import Predicts
+from torchrl_l1.control.law import L1State
+from torchrl_l1.control.layout import (
+    L1_KEY,
     Dynamics,
+    Layout,
     advance,
     as_action_jacobian,
     declared_dimension,
     make_step,
 )
-from torchrl_l1.control.jacobian import Predicts
-from torchrl_l1.control.law import L1Config, L1State
-from torchrl_l1.control.specs import L1_KEY, Layout
 
 
 class L1Controller(TensorDictModuleBase):

@@ -14,11 +14,18 @@ from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform
 
-from torchrl_l1.control.compilation import CompileMode
-from torchrl_l1.control.faces import Dynamics, StepFunction, advance, as_action_jacobian, make_step
+from torchrl_l1.compilation import CompileMode
+from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import Predicts
-from torchrl_l1.control.law import L1Config
-from torchrl_l1.control.specs import L1_KEY, Layout
+from torchrl_l1.control.layout import (
+    L1_KEY,
+    Dynamics,
+    Layout,
+    StepFunction,
+    advance,
+    as_action_jacobian,
+    make_step,
+)
 
 # Where a step's outcome waits, inside the tensordict, for the base environment to return.
 _PENDING = "_l1_pending"

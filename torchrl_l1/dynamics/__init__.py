@@ -3,13 +3,16 @@
 from torchrl_l1.dynamics.control_affine import ControlAffineDynamics
 from torchrl_l1.dynamics.ensemble import EnsembleMLP
 from torchrl_l1.dynamics.factory import MODEL_FORMS, make_dynamics, matched_hidden
-from torchrl_l1.dynamics.fit import FitReport, evaluate_members, fit_ensemble
-from torchrl_l1.dynamics.fit_config import FitConfig
+from torchrl_l1.dynamics.fit import (
+    EnsembleDynamicsLoss,
+    FitConfig,
+    FitReport,
+    evaluate_members,
+    fit_ensemble,
+)
 from torchrl_l1.dynamics.heads import HEADS, DeterministicHead, GaussianHead, Head, make_head
-from torchrl_l1.dynamics.imagination import imagine
-from torchrl_l1.dynamics.loss import EnsembleDynamicsLoss
+from torchrl_l1.dynamics.imagination import EnsembleModelEnv, EnsembleWorldModel, imagine
 from torchrl_l1.dynamics.model import EnsembleDynamics
-from torchrl_l1.dynamics.model_env import EnsembleModelEnv, EnsembleWorldModel
 from torchrl_l1.dynamics.normalizer import DataBox, Normalizer
 
 __all__ = [

@@ -1,18 +1,170 @@
-"""Fitting an ensemble to the transitions in a replay buffer, with early stopping."""
+"""Fitting an ensemble to real transitions: settings, loss, training loop."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import ReplayBuffer
+from torchrl.objectives.common import LossModule
 
-from torchrl_l1.dynamics.fit_config import FitConfig
-from torchrl_l1.dynamics.loss import EnsembleDynamicsLoss
 from torchrl_l1.dynamics.model import EnsembleDynamics
+
+
+@dataclass
+class FitConfig:
+    """How an ensemble is fitted.
+
+    Attributes:
+        learning_rate: Adam's step size at the start of a fit.
+        final_learning_rate_fraction: the step size at the end as a fraction of that at the
+            start, reached linearly over the gradient steps that a fit may take.
+        batch_size: transitions per member and gradient step.
+        max_epochs: passes over the training data.
+        max_gradient_steps: bound on gradient steps, whatever the number of epochs.
+        patience: epochs without a lower validation loss of any member before stopping.
+        validation_fraction: share of new transitions kept out of training for good.
+        weight_penalty: coefficient of half the squared hidden weights, divided by the number
+            of training transitions.
+        weight_decay: coefficients of half the squared weights, one per layer from input to
+            output, biases excepted; none if empty. The authors of PETS write theirs beside
+            twice the negative log-likelihood, or half the squared error: half of each does the
+            same here with a Gaussian head, twice with a deterministic one.
+        bootstrap: whether each member trains on its own resample of the training transitions,
+            as many drawn with replacement, anew at each fit. They are validated on the same.
+        elites: number of members kept as the model's elites after the fit, those of the lowest
+            validation loss; if null the model's elites stay as they are.
+    """
+
+    learning_rate: float = 1e-3
+    final_learning_rate_fraction: float = 0.1
+    batch_size: int = 500
+    max_epochs: int = 50
+    max_gradient_steps: int = 800
+    patience: int = 5
+    validation_fraction: float = 0.1
+    weight_penalty: float = 0.0
+    weight_decay: list[float] = field(default_factory=list)
+    bootstrap: bool = False
+    elites: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("batch_size", "max_epochs", "max_gradient_steps", "patience"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"fit.{name} must be at least 1, got {getattr(self, name)}")
+        if not 0 < self.validation_fraction < 1:
+            raise ValueError(
+                f"fit.validation_fraction must be between 0 and 1, got {self.validation_fraction}"
+            )
+        if self.learning_rate <= 0:
+            raise ValueError(f"fit.learning_rate must be positive, got {self.learning_rate}")
+        if not 0 < self.final_learning_rate_fraction <= 1:
+            raise ValueError(
+                "fit.final_learning_rate_fraction must be positive and at most 1, got "
+                f"{self.final_learning_rate_fraction}"
+            )
+        if not all(0 <= coefficient < math.inf for coefficient in self.weight_decay):
+            raise ValueError(
+                "fit.weight_decay must hold finite coefficients, none negative, got "
+                f"{list(self.weight_decay)}"
+            )
+        if self.elites is not None and self.elites < 1:
+            raise ValueError(f"fit.elites must be at least 1 or null, got {self.elites}")
+
+
+class EnsembleDynamicsLoss(LossModule):
+    """Loss of every member of an :class:`EnsembleDynamics` on its own batch of transitions.
+
+    The target is the normalised change of state; what is minimised per sample is the head's
+    business: the mean squared error for a :class:`DeterministicHead` (arXiv 2403.14860,
+    section 3.1), the negative log-likelihood for a :class:`GaussianHead` (arXiv 1805.12114). The
+    members' losses are summed, so that each member's gradient is what it would be alone; the
+    head's penalty joins the sum once.
+
+    Args:
+        dynamics: the model to be trained.
+
+    Input keys (see :meth:`set_keys`): ``observation``, ``action`` and ``next_observation`` with
+    batch size ``[B]`` (all members see the same batch) or ``[E, B]`` (a batch per member).
+    Output: ``loss_dynamics`` (scalar), to be minimised, and ``member_loss`` ``(E,)``, detached and
+    without the penalty, so that it compares members and fits.
+
+    Raises:
+        KeyError: if an input key is missing.
+
+    Examples:
+        >>> import torch
+        >>> model = EnsembleDynamics(3, 1, members=2, hidden=(8,))
+        >>> loss = EnsembleDynamicsLoss(model)
+        >>> data = TensorDict(
+        ...     {"observation": torch.zeros(5, 3), "action": torch.zeros(5, 1)}, batch_size=[5]
+        ... )
+        >>> data["next", "observation"] = torch.ones(5, 3)
+        >>> loss(data)["member_loss"].shape
+        torch.Size([2])
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        observation: NestedKey = "observation"
+        action: NestedKey = "action"
+        next_observation: NestedKey = ("next", "observation")
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_dynamics", "member_loss"]  # noqa: RUF012
+
+    def __init__(self, dynamics: EnsembleDynamics) -> None:
+        super().__init__()
+        self.dynamics = dynamics
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys read from the input."""
+        keys = self.tensor_keys
+        return [keys.observation, keys.action, keys.next_observation]
+
+    @in_keys.setter
+    def in_keys(self, value: list[NestedKey]) -> None:
+        raise AttributeError("use set_keys(observation=..., action=..., next_observation=...)")
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        pass
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Compute the loss of every member, see the class."""
+        observation, action, next_observation = (tensordict.get(key) for key in self.in_keys)
+        for key, value in zip(self.in_keys, (observation, action, next_observation), strict=True):
+            if value is None:
+                raise KeyError(
+                    f"EnsembleDynamicsLoss: {key!r} is not among {tensordict.keys(True, True)}"
+                )
+        model = self.dynamics
+        inputs = model.normalize_inputs(observation, action)
+        target = model.change_normalizer.normalize(next_observation - observation)
+        objective, per_member = self.objective(inputs, target)
+        return TensorDict(
+            {"loss_dynamics": objective, "member_loss": per_member.detach()}, batch_size=[]
+        )
+
+    def objective(self, inputs: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """What :meth:`forward` gives, from normalised inputs and targets.
+
+        Args:
+            inputs: ``(B, n + m)``, or of each member's own batch ``(E, B, n + m)``.
+            target: ``(B, n)`` or ``(E, B, n)``.
+
+        Returns:
+            the objective and the members' losses ``(E,)``, not detached.
+        """
+        head = self.dynamics.head
+        per_member = head.loss(self.dynamics.raw(inputs), target).mean(-1)
+        return per_member.sum() + head.penalty(), per_member
 
 
 @dataclass

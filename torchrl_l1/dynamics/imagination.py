@@ -1,12 +1,15 @@
-"""Imagined rollouts: a policy in a learned model, as a plain torch loop."""
+"""Imagined trajectories: a direct loop, and the model as a TorchRL environment."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_l1.dynamics.model import EnsembleDynamics
 
@@ -87,3 +90,122 @@ def imagine(
         },
     }
     return TensorDict(columns, batch_size=[horizon, batch]).transpose(0, 1)
+
+
+RewardFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+class EnsembleWorldModel(TensorDictModuleBase):
+    """One imagined step as a TensorDictModule: next observation, reward and termination.
+
+    Args:
+        dynamics: the ensemble.
+        reward: maps observation, action and next observation to ``(...)``.
+        propagation: ``"mean"`` of the ensemble, or a ``"random_member"`` of its elites per call.
+    """
+
+    in_keys = ["observation", "action"]  # noqa: RUF012
+    out_keys = ["observation", "reward", "terminated", "done"]  # noqa: RUF012
+
+    def __init__(
+        self, dynamics: EnsembleDynamics, reward: RewardFunction, propagation: str = "mean"
+    ) -> None:
+        super().__init__()
+        if propagation not in ("mean", "random_member"):
+            raise ValueError(f"propagation must be 'mean' or 'random_member', got {propagation!r}")
+        self.dynamics = dynamics
+        self.reward = reward
+        self.propagation = propagation
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Overwrite ``observation`` with the next one and write reward and termination."""
+        observation, action = tensordict["observation"], tensordict["action"]
+        if self.propagation == "mean":
+            change = self.dynamics.mean_change(observation, action)
+        else:
+            elites = self.dynamics.elites.tolist()
+            member = elites[int(torch.randint(len(elites), ()))]
+            change = self.dynamics.member_change(
+                observation.reshape(-1, observation.shape[-1]),
+                action.reshape(-1, action.shape[-1]),
+                member,
+            ).reshape(observation.shape)
+        successor = observation + change
+        left = ~self.dynamics.box.contains(successor).unsqueeze(-1)
+        return tensordict.update(
+            {
+                "observation": torch.where(left, observation, successor),
+                "reward": self.reward(observation, action, successor).unsqueeze(-1),
+                "terminated": left,
+                "done": left,
+            }
+        )
+
+
+class EnsembleModelEnv(ModelBasedEnvBase):
+    """A learned ensemble as an environment for TorchRL's rollouts, collectors and planners.
+
+    It terminates where the state leaves the box around the model's data. For the inner loop of
+    an algorithm :func:`~torchrl_l1.dynamics.imagine` does the same faster.
+
+    Args:
+        dynamics: the ensemble.
+        reward: maps observation, action and next observation to ``(...)``.
+        start: draws initial observations, ``count -> (count, n)``.
+        action_low: lower bound of the actions.
+        action_high: upper bound of the actions.
+        batch_size: environments side by side; ``()`` for planners, which bring their own.
+        propagation: see :class:`EnsembleWorldModel`.
+
+    Examples:
+        >>> model = EnsembleDynamics(3, 1, members=2, hidden=(8,))
+        >>> env = EnsembleModelEnv(
+        ...     model,
+        ...     reward=lambda x, u, successor: -x.square().sum(-1),
+        ...     start=lambda count: torch.zeros(count, 3),
+        ...     action_low=-1.0,
+        ...     action_high=1.0,
+        ...     batch_size=(4,),
+        ... )
+        >>> env.rollout(5)["next", "reward"].shape
+        torch.Size([4, 5, 1])
+    """
+
+    def __init__(
+        self,
+        dynamics: EnsembleDynamics,
+        reward: RewardFunction,
+        start: Callable[[int], Tensor],
+        action_low: float,
+        action_high: float,
+        batch_size: tuple[int, ...] = (),
+        propagation: str = "mean",
+    ) -> None:
+        device = next(dynamics.parameters()).device
+        super().__init__(
+            EnsembleWorldModel(dynamics, reward, propagation),
+            device=device,
+            batch_size=torch.Size(batch_size),
+        )
+        self.start = start
+        n, m = dynamics.observation_dim, dynamics.action_dim
+        self.observation_spec = Composite(
+            observation=Unbounded((*batch_size, n), device=device), shape=batch_size, device=device
+        )
+        self.state_spec = self.observation_spec.clone()
+        self.action_spec = Bounded(action_low, action_high, (*batch_size, m), device=device)
+        self.reward_spec = Unbounded((*batch_size, 1), device=device)
+
+    def _reset(self, tensordict: TensorDictBase | None, **kwargs: object) -> TensorDict:
+        shape = self.batch_size if tensordict is None else tensordict.shape
+        observation = self.start(max(1, shape.numel())).to(self.device)
+        return TensorDict(
+            {"observation": observation.reshape(*shape, -1)},
+            batch_size=shape,
+            device=self.device,
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        # All randomness is torch's global generator.
+        if seed is not None:
+            torch.manual_seed(seed)

@@ -5,16 +5,19 @@ Importing this package registers the tasks with Gymnasium, ``torchrl_l1/HalfChee
 
 from __future__ import annotations
 
-from .disturbances import ActuatorBias, ActuatorGain
-from .factory import make_env
-from .gymnasium_env import MujocoTaskEnv, gymnasium_id, register_tasks
-from .mujoco_env import BatchedMujocoEnv
-from .noise import ActionNoise, ObservationNoise
-from .simulator import BatchedSimulator
-from .start_states import StartStates
-from .task import Task
-from .task_simulation import TaskSimulation
-from .tasks import TASKS, get_task
+from torchrl_l1.envs.factory import make_env
+from torchrl_l1.envs.gymnasium_env import MujocoTaskEnv, gymnasium_id, register_tasks
+from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
+from torchrl_l1.envs.perturbations import (
+    ActionNoise,
+    ActuatorBias,
+    ActuatorGain,
+    ObservationNoise,
+    Perturbation,
+)
+from torchrl_l1.envs.simulation import BatchedSimulator, StartStates, TaskSimulation
+from torchrl_l1.envs.task import Task
+from torchrl_l1.envs.tasks import TASKS, get_task
 
 register_tasks()
 
@@ -27,6 +30,7 @@ __all__ = [
     "BatchedSimulator",
     "MujocoTaskEnv",
     "ObservationNoise",
+    "Perturbation",
     "StartStates",
     "Task",
     "TaskSimulation",

@@ -7,12 +7,9 @@ from collections.abc import Sequence
 import torch
 from torchrl.envs import Compose, Transform, TransformedEnv
 
-from .disturbances import ActuatorBias, ActuatorGain
-from .mujoco_env import BatchedMujocoEnv
-from .noise import ActionNoise, ObservationNoise
-from .task import Task
-
-__all__ = ["make_env"]
+from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
+from torchrl_l1.envs.perturbations import ActionNoise, ActuatorBias, ActuatorGain, ObservationNoise
+from torchrl_l1.envs.task import Task
 
 
 def _differs(value: float | Sequence[float], neutral: float) -> bool:

@@ -10,11 +10,9 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box
 
-from .task import Task
-from .task_simulation import TaskSimulation
-from .tasks import TASKS, get_task
-
-__all__ = ["MujocoTaskEnv", "gymnasium_id", "register_tasks"]
+from torchrl_l1.envs.simulation import TaskSimulation
+from torchrl_l1.envs.task import Task
+from torchrl_l1.envs.tasks import TASKS, get_task
 
 _ONLY = np.zeros(1, dtype=np.int64)
 

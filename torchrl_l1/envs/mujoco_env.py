@@ -10,11 +10,9 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from .task import Task
-from .task_simulation import TaskSimulation
-from .tasks import get_task
-
-__all__ = ["BatchedMujocoEnv"]
+from torchrl_l1.envs.simulation import TaskSimulation
+from torchrl_l1.envs.task import Task
+from torchrl_l1.envs.tasks import get_task
 
 
 class BatchedMujocoEnv(EnvBase):

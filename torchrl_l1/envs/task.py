@@ -10,17 +10,21 @@ from pathlib import Path
 import gymnasium
 import mujoco
 import numpy as np
+import torch
 from torch import Tensor
-
-from .task_functions import never
-
-__all__ = ["Task"]
 
 ObserveFn = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 RewardFn = Callable[[Tensor, Tensor, Tensor], Tensor]
 ResetFn = Callable[
     [np.random.Generator, np.ndarray, np.ndarray, int], tuple[np.ndarray, np.ndarray]
 ]
+
+
+def never(next_observation: Tensor) -> Tensor:
+    """No state ends the episode."""
+    return torch.zeros(
+        next_observation.shape[:-1], dtype=torch.bool, device=next_observation.device
+    )
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,4 @@
-"""The benchmark tasks: one table of facts that physics, rewards and imagination share.
-
-A :class:`~torchrl_l1.envs.Task` says everything that distinguishes one benchmark from another. The
-real environments and the imagined rollouts of a model-based algorithm read the *same* table, so
-they cannot drift apart; where the authors imagine another reward than the real one, the table says
-so (``reward_in_imagination``). The facts follow the authors' released code for arXiv 2403.14860,
-which builds on MBBL (arXiv:1907.02057); they differ from the ``-v4`` and ``-v5`` environments of
-Gymnasium, whose XML files (and nothing else) are used. The swing-up of a cart-pole follows the code
-of its own authors (arXiv 1805.12114) and has its XML file in this package.
-"""
+"""The benchmark tasks: their physics, rewards and terminations."""
 
 from __future__ import annotations
 
@@ -15,10 +6,146 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from . import task_functions as facts
-from .task import Task
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
 
-__all__ = ["TASKS", "Task", "get_task"]
+from torchrl_l1.envs.task import Task
+
+# Swimmer: the front end of its head in the frame of the body "torso", metres along that body.
+SWIMMER_TIP = 1.5
+
+# Cart-pole: from the hinge to the tip of the pole, metres; also how precisely the reward asks the
+# tip to be at its highest point.
+POLE_LENGTH = 0.6
+
+
+def observe_state(
+    qpos: np.ndarray, qvel: np.ndarray, previous_qpos: np.ndarray, *, skip: int
+) -> np.ndarray:
+    """All positions but the first ``skip``, then all velocities."""
+    return np.concatenate([qpos[..., skip:], qvel], axis=-1)
+
+
+def observe_swimmer(
+    qpos: np.ndarray, qvel: np.ndarray, previous_qpos: np.ndarray, *, dt: float
+) -> np.ndarray:
+    """The three angles, all velocities, and the mean x velocity of the head's tip in the step.
+
+    The last entry is zero at the start of an episode, where no step was taken. (The authors'
+    environment repeats what it was at the end of the episode before: the data would depend on
+    what ran before them.)
+    """
+    tip, previous_tip = (q[..., 0] + SWIMMER_TIP * np.cos(q[..., 2]) for q in (qpos, previous_qpos))
+    velocity = (tip - previous_tip) / dt
+    return np.concatenate([qpos[..., 2:], qvel, velocity[..., None]], axis=-1)
+
+
+def uniform_reset(
+    rng: np.random.Generator, qpos0: np.ndarray, qvel0: np.ndarray, n: int, *, half_width: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Uniform noise around the XML's pose and velocity."""
+    qpos = qpos0 + rng.uniform(-half_width, half_width, (n, qpos0.size))
+    qvel = qvel0 + rng.uniform(-half_width, half_width, (n, qvel0.size))
+    return qpos, qvel
+
+
+def normal_reset(
+    rng: np.random.Generator,
+    qpos0: np.ndarray,
+    qvel0: np.ndarray,
+    n: int,
+    *,
+    standard_deviation: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal noise around the XML's pose and velocity."""
+    qpos = qpos0 + standard_deviation * rng.standard_normal((n, qpos0.size))
+    qvel = qvel0 + standard_deviation * rng.standard_normal((n, qvel0.size))
+    return qpos, qvel
+
+
+def cheetah_reset(
+    rng: np.random.Generator, qpos0: np.ndarray, qvel0: np.ndarray, n: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Uniform noise (half-width 0.1) on the pose, normal (0.1) on the velocities."""
+    qpos = qpos0 + rng.uniform(-0.1, 0.1, (n, qpos0.size))
+    qvel = qvel0 + 0.1 * rng.standard_normal((n, qvel0.size))
+    return qpos, qvel
+
+
+def pendulum_reward(observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
+    """Minus the squared angle before the step."""
+    return -observation[..., 1].square()
+
+
+def swimmer_reward(observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
+    """Tip velocity of the step, less a cost of the action as received, unclipped."""
+    return next_observation[..., -1] - 1e-4 * action.square().sum(-1)
+
+
+def swimmer_imagined_reward(
+    observation: Tensor, action: Tensor, next_observation: Tensor
+) -> Tensor:
+    """As the authors imagine it: the tip velocity of the step *before*."""
+    return observation[..., -1] - 1e-4 * action.square().sum(-1)
+
+
+def _control_cost(action: Tensor) -> Tensor:
+    return 0.1 * action.clamp(-1.0, 1.0).square().sum(-1)
+
+
+def _height_cost(observation: Tensor) -> Tensor:
+    return 3.0 * (observation[..., 0] - 1.3).square()
+
+
+def hopper_reward(observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
+    """Speed before the step, control cost (clipped action), height before the step, plus one."""
+    return observation[..., 5] - _control_cost(action) - _height_cost(observation) + 1.0
+
+
+def walker_fallen(next_observation: Tensor) -> Tensor:
+    """Torso not between 0.8 and 2 m, or pitched by 1 rad or more."""
+    height, pitch = next_observation[..., 0], next_observation[..., 1]
+    return (height >= 2.0) | (height <= 0.8) | (pitch.abs() >= 1.0)
+
+
+def walker_reward(observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
+    """As Hopper's, but the one is earned only if the step did not end in a fall."""
+    alive = (~walker_fallen(next_observation)).to(observation)
+    return observation[..., 8] - _control_cost(action) - _height_cost(observation) + alive
+
+
+def walker_imagined_reward(observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
+    """As the authors imagine it: the height is that *after* the step."""
+    alive = (~walker_fallen(next_observation)).to(observation)
+    return observation[..., 8] - _control_cost(action) - _height_cost(next_observation) + alive
+
+
+def cheetah_reward(observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
+    """Speed before the step less the control cost (clipped action)."""
+    return observation[..., 8] - _control_cost(action)
+
+
+def cartpole_reward(observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
+    r"""How near the pole's tip is to its highest point over the middle of the rail, after the step.
+
+    :math:`e^{-d^2 / l^2} - 0.01 \lVert a \rVert^2`, with the distance d of the tip
+    :math:`(x - l \sin\theta, -l \cos\theta)` from :math:`(0, l)`, and the action as received,
+    unclipped. Upright in the middle and without force it is one, hanging there :math:`e^{-4}`.
+    """
+    x, theta = next_observation[..., 0], next_observation[..., 1]
+    across = x - POLE_LENGTH * theta.sin()
+    below = POLE_LENGTH * (1 + theta.cos())
+    nearness = torch.exp(-(across.square() + below.square()) / POLE_LENGTH**2)
+    return nearness - 0.01 * action.square().sum(-1)
+
+
+def unclamp_actuators(spec: mujoco.MjSpec) -> None:
+    """Lets actuators follow inputs beyond their ``ctrlrange``, which stays what it is."""
+    for actuator in spec.actuators:
+        actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
+
 
 # Observation: cart position, pole angle (rad), cart velocity, angular velocity. The cost is
 # quadratic in the angle and nothing ends the episode, unlike Gymnasium's "+1 per step until the
@@ -33,15 +160,15 @@ _INVERTED_PENDULUM = Task(
     action_dim=1,
     action_low=-3.0,
     action_high=3.0,
-    observe=partial(facts.observe_state, skip=0),
-    sample_reset=partial(facts.uniform_reset, half_width=0.01),
-    reward=facts.pendulum_reward,
+    observe=partial(observe_state, skip=0),
+    sample_reset=partial(uniform_reset, half_width=0.01),
+    reward=pendulum_reward,
 )
 
 # The same with the motor of the original experiments: MuJoCo 1.31 let it follow inputs beyond its
 # range, which only a policy whose actions are not clipped (nor corrected by L1) ever sends.
 _INVERTED_PENDULUM_UNCLAMPED = replace(
-    _INVERTED_PENDULUM, name="inverted_pendulum_unclamped", patch=facts.unclamp_actuators
+    _INVERTED_PENDULUM, name="inverted_pendulum_unclamped", patch=unclamp_actuators
 )
 
 # Observation: angles of body and two joints (rad), velocities of the torso frame (x, y) and of
@@ -57,10 +184,10 @@ _SWIMMER = Task(
     action_dim=2,
     action_low=-1.0,
     action_high=1.0,
-    observe=partial(facts.observe_swimmer, dt=0.04),
-    sample_reset=partial(facts.uniform_reset, half_width=0.1),
-    reward=facts.swimmer_reward,
-    reward_in_imagination=facts.swimmer_imagined_reward,
+    observe=partial(observe_swimmer, dt=0.04),
+    sample_reset=partial(uniform_reset, half_width=0.1),
+    reward=swimmer_reward,
+    reward_in_imagination=swimmer_imagined_reward,
 )
 
 # Observation: torso height, pitch, three joint angles, then all velocities; entry 5 is the
@@ -75,9 +202,9 @@ _HOPPER = Task(
     action_dim=3,
     action_low=-1.0,
     action_high=1.0,
-    observe=partial(facts.observe_state, skip=1),
-    sample_reset=partial(facts.uniform_reset, half_width=0.005),
-    reward=facts.hopper_reward,
+    observe=partial(observe_state, skip=1),
+    sample_reset=partial(uniform_reset, half_width=0.005),
+    reward=hopper_reward,
 )
 
 # Observation: torso height, pitch, six joint angles, then all velocities; entry 8 is the
@@ -93,11 +220,11 @@ _WALKER = Task(
     action_dim=6,
     action_low=-1.0,
     action_high=1.0,
-    observe=partial(facts.observe_state, skip=1),
-    sample_reset=partial(facts.uniform_reset, half_width=0.005),
-    reward=facts.walker_reward,
-    terminated=facts.walker_fallen,
-    reward_in_imagination=facts.walker_imagined_reward,
+    observe=partial(observe_state, skip=1),
+    sample_reset=partial(uniform_reset, half_width=0.005),
+    reward=walker_reward,
+    terminated=walker_fallen,
+    reward_in_imagination=walker_imagined_reward,
 )
 
 # Observation: all positions but the root's x, then all velocities; entry 8 is the root's
@@ -113,9 +240,9 @@ _HALF_CHEETAH = Task(
     action_dim=6,
     action_low=-1.0,
     action_high=1.0,
-    observe=partial(facts.observe_state, skip=1),
-    sample_reset=facts.cheetah_reset,
-    reward=facts.cheetah_reward,
+    observe=partial(observe_state, skip=1),
+    sample_reset=cheetah_reset,
+    reward=cheetah_reward,
 )
 
 # Observation: cart position (m), pole angle (rad, zero where it hangs, not wrapped), cart velocity,
@@ -131,9 +258,9 @@ _CARTPOLE = Task(
     action_dim=1,
     action_low=-3.0,
     action_high=3.0,
-    observe=partial(facts.observe_state, skip=0),
-    sample_reset=partial(facts.normal_reset, standard_deviation=0.1),
-    reward=facts.cartpole_reward,
+    observe=partial(observe_state, skip=0),
+    sample_reset=partial(normal_reset, standard_deviation=0.1),
+    reward=cartpole_reward,
 )
 
 TASKS: dict[str, Task] = {

@@ -13,12 +13,11 @@ from omegaconf import OmegaConf
 from torchrl_l1.algorithms.algorithm import Algorithm
 from torchrl_l1.algorithms.collection import (
     Collection,
-    Perturbation,
     first_episodes,
     return_metrics,
     signal_metrics,
 )
-from torchrl_l1.experiment.finding import read_config
+from torchrl_l1.envs import Perturbation
 from torchrl_l1.experiment.l1_options import (
     closest_option,
     controller_label,
@@ -26,9 +25,8 @@ from torchrl_l1.experiment.l1_options import (
     same_controller,
 )
 from torchrl_l1.experiment.recipes import group_setting
-from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
-from torchrl_l1.experiment.schema import schema_of
-from torchrl_l1.experiment.settings import L1Settings, RunSettings, l1_config
+from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError, read_config
+from torchrl_l1.experiment.settings import L1Settings, RunSettings, l1_config, schema_of
 from torchrl_l1.experiment.stages import STAGES, find_stage, kinds_of
 
 

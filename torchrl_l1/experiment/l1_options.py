@@ -11,17 +11,6 @@ from typing import Any
 from torchrl_l1.experiment.recipes import group_options, group_setting
 from torchrl_l1.experiment.settings import L1Settings, l1_config
 
-__all__ = [
-    "check_tuning",
-    "closest_option",
-    "controller_label",
-    "departures",
-    "filter_gain",
-    "l1_option",
-    "l1_options",
-    "same_controller",
-]
-
 # What runs are tuned by; it makes no other controller.
 _TUNED = ("enabled", "epsilon", "compile")
 # Two ways to give one number.

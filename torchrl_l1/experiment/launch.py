@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl_l1.experiment.errors import USER_ERRORS, message
 from torchrl_l1.experiment.recipes import find_recipe, recipes_dir, shared_dir
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.schema import SCHEMAS, register
+from torchrl_l1.experiment.settings import SCHEMAS, register
 
 # The run directory is ours to open, so Hydra must not create or write to it first.
 _HYDRA_SETTINGS = [

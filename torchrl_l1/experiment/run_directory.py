@@ -7,17 +7,72 @@ import fcntl
 import io
 import json
 import os
+import platform
+import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import torch
+import yaml  # type: ignore[import-untyped]
 from omegaconf import OmegaConf
 
-from torchrl_l1.experiment.schema import schema_defaults
-from torchrl_l1.experiment.settings import VOLATILE_KEYS, flatten
-from torchrl_l1.experiment.versions import versions
+import torchrl_l1
+from torchrl_l1.experiment.settings import VOLATILE_KEYS, flatten, schema_defaults
+
+PACKAGES = ("torch", "tensordict", "torchrl", "gymnasium", "mujoco", "numpy")
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, the platform and the packages that a result depends on.
+
+    In a git checkout of this package the commit joins them, see :func:`commit`.
+    """
+    found = {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        # Not from the metadata of an installation: it may be that of another copy.
+        "torchrl-l1": torchrl_l1.__version__,
+    }
+    package = Path(torchrl_l1.__file__).parent
+    at = commit(package)
+    if at is not None:
+        found["torchrl-l1 commit"] = at
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def commit(package: Path) -> str | None:
+    """The commit of the git checkout that a package's folder lies at the top of.
+
+    Args:
+        package: the folder.
+
+    Returns:
+        its hash, followed by ``with changes`` where files of the package differ from it;
+        ``None`` where there is no checkout or no git.
+    """
+    if not (package.parent / ".git").exists():
+        return None
+    # Without locks: many runs may ask at once, and beside somebody's own git.
+    git = ["git", "--no-optional-locks", "-C", str(package.parent)]
+    try:
+        head = _output([*git, "rev-parse", "HEAD"])
+        changes = _output([*git, "status", "--porcelain", "--", package.name])
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return f"{head} with changes" if changes else head
+
+
+def _output(command: list[str]) -> str:
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
 
 # What a run killed in its first moments may leave behind; its directory is still free.
 _BEFORE_CONFIG = (".lock", "versions.json", "versions.json.tmp", "config.yaml.tmp")
@@ -211,3 +266,36 @@ def save_atomically(file: Path, state: object) -> None:
         handle.flush()
         os.fsync(handle.fileno())
     os.replace(temporary, file)
+
+
+def run_directories(folder: Path) -> Iterator[tuple[Path, dict[str, Any] | RunDirectoryError]]:
+    """Every run directory in or below a folder, with its configuration or why that is unreadable.
+
+    Folders come in alphabetical order; hidden ones, and those that are links, are left out.
+    """
+    for path, below, files in os.walk(folder):
+        below[:] = sorted(name for name in below if not name.startswith("."))
+        if "config.yaml" not in files:
+            continue
+        config: dict[str, Any] | RunDirectoryError
+        try:
+            config = read_config(Path(path) / "config.yaml")
+        except RunDirectoryError as error:
+            config = error
+        # Any tool may keep a config.yaml; a run's says which task and which seed.
+        if isinstance(config, RunDirectoryError) or ("task" in config and "seed" in config):
+            below.clear()
+            yield Path(path), config
+
+
+def read_config(file: Path) -> dict[str, Any]:
+    """A configuration; empty if the file holds something else than keys and values.
+
+    Raises:
+        RunDirectoryError: if the file cannot be read.
+    """
+    try:
+        config = OmegaConf.to_container(OmegaConf.load(file))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise RunDirectoryError(f"cannot read {file}: {error}") from error
+    return {str(k): v for k, v in config.items()} if isinstance(config, dict) else {}

@@ -1,19 +1,29 @@
-"""Settings of every recipe, whatever the algorithm."""
+"""Settings of every recipe, and the typed schemas behind the YAML files."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, fields
+from functools import cache
+from typing import Any, TypeVar
 
-from omegaconf import MISSING
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING, OmegaConf
 
-from torchrl_l1.algorithms import Perturbation
-from torchrl_l1.algorithms.algorithm import Algorithm
-from torchrl_l1.algorithms.device import DEVICES
+from torchrl_l1.algorithms import (
+    MBMF,
+    METRPO,
+    PETS,
+    MBMFConfig,
+    METRPOConfig,
+    Perturbation,
+    PETSConfig,
+)
+from torchrl_l1.algorithms.algorithm import DEVICES, Algorithm
+from torchrl_l1.algorithms.metrpo_config import check_clipping
+from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config
-from torchrl_l1.control.compilation import CompileMode
 from torchrl_l1.envs import get_task
 from torchrl_l1.experiment.stages import STAGES
 
@@ -97,14 +107,6 @@ class RunSettings(ABC):
     wandb: WandbSettings = field(default_factory=WandbSettings)
 
     def __post_init__(self) -> None:
-        """Refuse settings that could only fail later.
-
-        Whether there is a CUDA device is not asked here: a run that was trained on one may be
-        read anywhere.
-
-        Raises:
-            ValueError: naming the setting.
-        """
         fixed = type(self).algorithm
         if self.algorithm != fixed:
             raise ValueError(
@@ -187,3 +189,117 @@ def compile_mode(setting: bool | str) -> CompileMode:
     if setting not in (True, False, "auto"):
         raise ValueError(f"l1.compile must be true, false or auto, got {setting!r}")
     return setting  # type: ignore[return-value]
+
+
+_Config = TypeVar("_Config")
+
+
+# The algorithm's settings come first: they say how many outer iterations there are.
+@dataclass
+class METRPORecipe(METRPOConfig, RunSettings):
+    """A METRPO recipe: run settings and the algorithm's own, side by side.
+
+    Attributes:
+        published_horizon: imagined horizon of the published runs, for ``preset=paper``.
+    """
+
+    algorithm: str = "metrpo"
+    published_horizon: int = 1000
+
+    def __post_init__(self) -> None:
+        RunSettings.__post_init__(self)
+        METRPOConfig.__post_init__(self)
+        check_clipping(self.clip_actions, self.l1.enabled)
+        if self.published_horizon < 1:
+            raise ValueError(f"published_horizon must be at least 1, got {self.published_horizon}")
+
+    def build(self) -> METRPO:
+        """The algorithm, fresh."""
+        return METRPO(self.task, _part(self, METRPOConfig), **_surroundings(self))
+
+
+@dataclass
+class PETSRecipe(PETSConfig, RunSettings):
+    """A recipe of PETS or DETS: run settings and the algorithm's own, side by side.
+
+    The two differ in what a member of the ensemble predicts: a distribution, or a point.
+    """
+
+    algorithm: str = "pets"
+
+    def __post_init__(self) -> None:
+        RunSettings.__post_init__(self)
+        PETSConfig.__post_init__(self)
+
+    def build(self) -> PETS:
+        """The algorithm, fresh."""
+        return PETS(self.task, _part(self, PETSConfig), **_surroundings(self))
+
+
+@dataclass
+class MBMFRecipe(MBMFConfig, RunSettings):
+    """An MBMF recipe: run settings and the algorithm's own, side by side."""
+
+    algorithm: str = "mbmf"
+
+    def __post_init__(self) -> None:
+        RunSettings.__post_init__(self)
+        MBMFConfig.__post_init__(self)
+
+    def build(self) -> MBMF:
+        """The algorithm, fresh."""
+        return MBMF(self.task, _part(self, MBMFConfig), **_surroundings(self))
+
+
+SCHEMAS: dict[str, type[RunSettings]] = {
+    "metrpo": METRPORecipe,
+    "pets": PETSRecipe,
+    "mbmf": MBMFRecipe,
+}
+"""Schema of the recipes of each algorithm. In a recipe's defaults it is ``<name>_recipe``."""
+
+
+def register() -> None:
+    """Make the schemas known to Hydra."""
+    for name, schema in SCHEMAS.items():
+        ConfigStore.instance().store(name=f"{name}_recipe", node=schema)
+
+
+def schema_of(config: Mapping[str, Any]) -> type[RunSettings]:
+    """The schema of a stored configuration; of METRPO for those that are older than others.
+
+    Raises:
+        ValueError: for an algorithm that there is not.
+    """
+    name = str(config.get("algorithm", "metrpo"))
+    if name not in SCHEMAS:
+        raise ValueError(f"unknown algorithm {name!r}; there are {', '.join(SCHEMAS)}")
+    return SCHEMAS[name]
+
+
+def schema_defaults(config: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Every key of a configuration's schema that has a default, dotted, with that default."""
+    return _defaults(schema_of(config).algorithm)
+
+
+@cache
+def _defaults(algorithm: str) -> Mapping[str, Any]:
+    node = OmegaConf.to_container(OmegaConf.structured(SCHEMAS[algorithm]))
+    return {key: value for key, value in flatten(node).items() if value != MISSING}
+
+
+def _part(recipe: RunSettings, config: type[_Config]) -> _Config:
+    """The algorithm's part of a recipe."""
+    return config(**{f.name: getattr(recipe, f.name) for f in fields(config)})  # type: ignore[arg-type]
+
+
+def _surroundings(recipe: RunSettings) -> dict[str, Any]:
+    """What every algorithm takes beside its own settings."""
+    return {
+        "l1": l1_config(recipe.l1, recipe.task),
+        "perturbation": recipe.perturbation,
+        "seed": recipe.seed,
+        "horizon": recipe.horizon,
+        "device": recipe.device,
+        "compile_l1": compile_mode(recipe.l1.compile),
+    }

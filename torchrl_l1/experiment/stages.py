@@ -8,8 +8,6 @@ from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModuleBase
 
 from torchrl_l1.algorithms import mbmf_metrics
 
-__all__ = ["KINDS", "STAGES", "find_stage", "kinds_of"]
-
 STAGES: Mapping[str, tuple[str, ...]] = {
     "metrpo": ("policy",),
     "pets": ("planner",),

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrl_l1.control import law
-from torchrl_l1.control.law import L1Config
+from torchrl_l1.control.config import L1Config
 
 _INPUTS = ("obs", "drift", "jac", "action", "switch", "dt", "bound")
 _OUTPUTS = ("u", "sigma_m", "x_hat")

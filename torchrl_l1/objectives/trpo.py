@@ -36,11 +36,6 @@ class TRPOConfig:
     accept_ratio: float = 0.1
 
     def __post_init__(self) -> None:
-        """Refuse settings that could only fail later.
-
-        Raises:
-            ValueError: naming the setting.
-        """
         for name in ("max_kl", "cg_iterations", "max_backtracks"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"trpo.{name} must be positive, got {getattr(self, name)}")

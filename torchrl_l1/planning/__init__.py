@@ -6,7 +6,7 @@ from torchrl_l1.planning.compiled_motion import resolve_compilation
 from torchrl_l1.planning.mppi import MPPIConfig
 from torchrl_l1.planning.mppi import plan as plan_mppi
 from torchrl_l1.planning.network import PlanningNetwork, Precision, resolve_precision
-from torchrl_l1.planning.particle_motion import Propagation
+from torchrl_l1.planning.particles import Propagation
 from torchrl_l1.planning.planner import ModelPredictiveController
 from torchrl_l1.planning.random_shooting import ShootingConfig
 from torchrl_l1.planning.random_shooting import plan as plan_shooting

@@ -51,11 +51,6 @@ class CEMConfig:
     return_best: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse settings that could only fail later.
-
-        Raises:
-            ValueError: naming the setting.
-        """
         require(
             self,
             horizon=(1, math.inf),

@@ -14,10 +14,9 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from torchrl_l1.control.compilation import CompileMode, compiled
+from torchrl_l1.compilation import CompileMode, compiled
 from torchrl_l1.planning.network import PlanningNetwork, affine_output
-from torchrl_l1.planning.particle_draws import Draws
-from torchrl_l1.planning.particle_motion import Predict, Propagation
+from torchrl_l1.planning.particles import Draws, Predict, Propagation
 
 _Group = tuple[int, int, int]
 
@@ -67,7 +66,7 @@ def compiled_predictor(
     draws: Draws,
     mode: CompileMode,
 ) -> Predict:
-    """What :func:`torchrl_l1.planning.particle_motion.predictor` gives, compiled.
+    """What :func:`torchrl_l1.planning.particles.predictor` gives, compiled.
 
     Plans with ensembles of the same shape and precision, the same shares and the same propagation
     share a graph, whatever the weights and the number of rows.

@@ -35,11 +35,6 @@ class ShootingConfig:
     warm_start: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse settings that could only fail later.
-
-        Raises:
-            ValueError: naming the setting.
-        """
         require(self, horizon=(1, math.inf), candidates=(1, math.inf))
 
 

@@ -9,18 +9,25 @@ from typing import get_args
 import torch
 from torch import Tensor
 
-from torchrl_l1.control.compilation import CompileMode
+from torchrl_l1.compilation import CompileMode
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.planning.compiled_motion import compiled_predictor, resolve_compilation
-from torchrl_l1.planning.imagined_returns import RewardFunction, Termination, imagined_returns
 from torchrl_l1.planning.network import (
     PlanningNetwork,
     Precision,
     planning_precision,
     resolve_precision,
 )
-from torchrl_l1.planning.particle_draws import Draws, scenarios
-from torchrl_l1.planning.particle_motion import Propagation, member_shares, predictor
+from torchrl_l1.planning.particles import (
+    Draws,
+    Propagation,
+    RewardFunction,
+    Termination,
+    imagined_returns,
+    member_shares,
+    predictor,
+    scenarios,
+)
 from torchrl_l1.planning.sequences import Evaluate
 
 # Trajectories that go through the horizon together: enough of them to make little of what a call
@@ -174,7 +181,6 @@ class TrajectorySampler:
     compile: CompileMode = False
 
     def __post_init__(self) -> None:
-        """Refuse settings that could only fail later."""
         check_sampling(
             self.particles,
             self.propagation,

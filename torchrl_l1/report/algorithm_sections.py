@@ -16,8 +16,6 @@ from torchrl_l1.report.rendering import algorithm_pairs_table, algorithm_table
 from torchrl_l1.report.style import title
 from torchrl_l1.report.variants import Study
 
-__all__ = ["algorithm_sections"]
-
 
 def algorithm_sections(page: Page, studies: Sequence[Study]) -> None:
     """Curves, returns and differences where several algorithms learned the same task and noise."""

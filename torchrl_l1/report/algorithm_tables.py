@@ -11,8 +11,6 @@ from torchrl_l1.report.style import algorithm_label
 from torchrl_l1.report.training_tables import difference_summary, training_row
 from torchrl_l1.report.variants import Cell, Study, noise_order
 
-__all__ = ["algorithm_pairs", "algorithm_rows", "compared_places", "differing_settings"]
-
 # Of a row of the training, what can be compared.
 _KEYS = (
     "seeds",

@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 
 from torchrl_l1.report.statistics import WINDOW
 
-__all__ = ["ALGORITHMS", "MEASURING", "AlgorithmFacts", "StageFacts", "facts"]
-
 MEASURING = "evaluate"
 """The phase that only measures returns: no part of the training."""
 

@@ -17,8 +17,6 @@ from torchrl_l1.report.training_sections import training_sections
 from torchrl_l1.report.training_tables import run_rows
 from torchrl_l1.report.variants import Study, studies
 
-__all__ = ["report"]
-
 
 def report(
     folders: Sequence[Path], output: Path | None = None, reference_curves: Path | None = None

@@ -8,12 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from torchrl_l1.campaign.description import read_campaign
-from torchrl_l1.campaign.yaml_file import load_yaml
+from torchrl_l1.campaign.description import load_yaml, read_campaign
 from torchrl_l1.experiment.recipes import available_campaigns
 from torchrl_l1.report.runs import Run
-
-__all__ = ["CampaignState", "find_campaigns"]
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,6 @@ from torchrl_l1.report.reference_curves import Curves
 from torchrl_l1.report.runs import Run
 from torchrl_l1.report.style import fit_scale, grid, legend_below, save
 
-__all__ = ["Band", "Grey", "Line", "Panel", "plot_panels"]
-
 # Trainings that differ more in length are drawn over a logarithmic axis.
 _MOST_TIMES = 5
 

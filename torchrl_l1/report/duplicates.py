@@ -9,8 +9,6 @@ import numpy as np
 
 from torchrl_l1.report.runs import Evaluation, Run
 
-__all__ = ["distinct"]
-
 
 def distinct(runs: Sequence[Run], same: Callable[[Run], Hashable]) -> tuple[list[Run], list[Run]]:
     """One run of each kind, the one that is furthest, and the others.

@@ -23,8 +23,6 @@ from torchrl_l1.report.style import (
 )
 from torchrl_l1.report.variants import noise_order
 
-__all__ = ["plot_ablation", "plot_disturbances"]
-
 Row = Mapping[str, Any]
 
 

@@ -15,8 +15,6 @@ from torchrl_l1.report.style import arm_label, named, noise_words, title
 from torchrl_l1.report.tuning_figures import plot_tuning, tuning_rows
 from torchrl_l1.report.variants import Study
 
-__all__ = ["evaluation_sections"]
-
 Row = Mapping[str, Any]
 Section = Callable[[Page, AlgorithmFacts, Sequence[Row]], None]
 

@@ -15,8 +15,6 @@ from torchrl_l1.report.statistics import mean_interval
 from torchrl_l1.report.training_tables import difference_summary
 from torchrl_l1.report.variants import Study, noise_order, variant_text
 
-__all__ = ["PHASES", "ablation_rows", "evaluation_names", "evaluation_rows"]
-
 PHASES = ("neither", "training only", "testing only", "both")
 """Where L1 is on, in the order in which tables and figures show it."""
 

@@ -10,8 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from torchrl_l1.experiment.finding import run_directories
-from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
+from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError, run_directories
 from torchrl_l1.report.algorithms import facts
 from torchrl_l1.report.reading import (
     SIGNALS,
@@ -23,8 +22,6 @@ from torchrl_l1.report.reading import (
 )
 from torchrl_l1.report.runs import Evaluation, Run
 from torchrl_l1.report.settings import identify
-
-__all__ = ["Findings", "find_readable_runs", "find_runs"]
 
 T = TypeVar("T")
 

@@ -19,8 +19,6 @@ from torchrl_l1.report.style import (
 )
 from torchrl_l1.report.variants import Cell, Study
 
-__all__ = ["plot_algorithms", "plot_comparison", "plot_stages", "plot_task"]
-
 
 def plot_task(
     study: Study,

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-__all__ = ["numeric_rows"]
-
 
 def numeric_rows(
     file: Path,

@@ -13,8 +13,6 @@ from torchrl_l1.report.runs import Run
 from torchrl_l1.report.style import named
 from torchrl_l1.report.tables import markdown
 
-__all__ = ["Page", "slug"]
-
 Row = Mapping[str, Any]
 
 

@@ -10,8 +10,6 @@ from importlib.resources import files
 from torchrl_l1.report.algorithms import facts
 from torchrl_l1.report.settings import BASELINE
 
-__all__ = ["PublishedCell", "published_cell", "published_cells"]
-
 # Controllers whose results the paper's "L1" stands for: its own and that of its released code.
 _PUBLISHED_ARMS = ("paper", "reference")
 

@@ -16,17 +16,6 @@ from torchrl_l1.experiment.run_directory import RunDirectoryError
 from torchrl_l1.report.algorithms import AlgorithmFacts
 from torchrl_l1.report.numeric_csv import numeric_rows
 
-__all__ = [
-    "SIGNALS",
-    "Evaluation",
-    "distinct_policies",
-    "one_policy",
-    "read_evaluations",
-    "read_metrics",
-    "read_seconds",
-    "read_versions",
-]
-
 _SWITCH_RATE = "l1/switch_rate"
 
 SIGNALS = (_SWITCH_RATE, "l1/u_a", "l1/saturation")

@@ -10,8 +10,6 @@ import numpy as np
 from torchrl_l1.report.numeric_csv import numeric_rows
 from torchrl_l1.report.settings import BASELINE
 
-__all__ = ["Curves", "ReferenceCurves"]
-
 COLUMNS = ("arm", "setting", "seed", "iteration", "total_train_samples", "average_return")
 
 _TASKS = {

@@ -9,17 +9,6 @@ from torchrl_l1.report.evaluation_tables import PHASES
 from torchrl_l1.report.settings import BASELINE
 from torchrl_l1.report.tables import Footnotes, interval_text, markdown, number
 
-__all__ = [
-    "ablation_table",
-    "algorithm_pairs_table",
-    "algorithm_table",
-    "evaluation_table",
-    "paired_table",
-    "stage_table",
-    "training_table",
-    "tuning_table",
-]
-
 Row = Mapping[str, Any]
 
 

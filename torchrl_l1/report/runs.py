@@ -14,8 +14,6 @@ from torchrl_l1.report.reading import Evaluation
 from torchrl_l1.report.settings import Identity
 from torchrl_l1.report.statistics import WINDOW
 
-__all__ = ["Evaluation", "Run"]
-
 
 @dataclass
 class Run:

@@ -12,11 +12,8 @@ from omegaconf import OmegaConf
 from torchrl_l1.control.config import DEFAULT_ALPHA
 from torchrl_l1.experiment.l1_options import closest_option, departures, filter_gain
 from torchrl_l1.experiment.recipes import shared_dir
-from torchrl_l1.experiment.schema import schema_defaults
-from torchrl_l1.experiment.settings import VOLATILE_KEYS, L1Settings, flatten
+from torchrl_l1.experiment.settings import VOLATILE_KEYS, L1Settings, flatten, schema_defaults
 from torchrl_l1.report.algorithms import facts
-
-__all__ = ["BASELINE", "NOISES", "Identity", "identify"]
 
 BASELINE = "off"
 """Name of the arm without L1."""

@@ -9,8 +9,6 @@ from torchrl_l1.report.stage_tables import stage_rows
 from torchrl_l1.report.style import title
 from torchrl_l1.report.variants import Study
 
-__all__ = ["stage_sections"]
-
 
 def stage_sections(page: Page, study: Study) -> None:
     """What each stage has reached, with L1 and without; nothing where there is one stage only."""

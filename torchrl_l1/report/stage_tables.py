@@ -18,8 +18,6 @@ from torchrl_l1.report.training_tables import (
 )
 from torchrl_l1.report.variants import Study
 
-__all__ = ["stage_return", "stage_rows"]
-
 _SIGNALS = {"switches_per_1000": ("l1/switch_rate", 1000), "u_a": ("l1/u_a", 1)}
 
 

@@ -10,18 +10,6 @@ from typing import Any
 import numpy as np
 from scipy.stats import bootstrap, t, trim_mean
 
-__all__ = [
-    "MIN_INTERQUARTILE",
-    "MIN_SAMPLES",
-    "WINDOW",
-    "Interval",
-    "final_return",
-    "interquartile_interval",
-    "interquartile_mean",
-    "mean_interval",
-    "published_spread",
-]
-
 WINDOW = 3
 """Outer iterations at the end of a run that its return is the mean of, as in the paper."""
 

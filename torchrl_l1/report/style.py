@@ -18,21 +18,6 @@ from matplotlib.figure import Figure
 
 from torchrl_l1.report.settings import BASELINE
 
-__all__ = [
-    "algorithm_color",
-    "algorithm_label",
-    "arm_label",
-    "arm_style",
-    "color",
-    "fit_scale",
-    "grid",
-    "legend_below",
-    "named",
-    "noise_words",
-    "save",
-    "title",
-]
-
 # Okabe and Ito: told apart with any colour vision. Grey is kept for the authors' curves.
 _ARMS = {"off": "#D55E00", "paper": "#0072B2", "reference": "#009E73", "slow": "#CC79A7"}
 # Not those of the arms, which vary within an algorithm.

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-__all__ = ["Footnotes", "interval_text", "markdown", "number"]
-
 
 def number(value: float | None) -> str:
     """Three significant digits, and no fewer than the units.

@@ -12,8 +12,6 @@ from torchrl_l1.report.runs import Run
 from torchrl_l1.report.tables import markdown, number
 from torchrl_l1.report.variants import Study
 
-__all__ = ["time_rows", "time_table"]
-
 _WORDS = {
     "fit": "fit",
     "trpo": "TRPO",

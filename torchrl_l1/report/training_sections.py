@@ -12,8 +12,6 @@ from torchrl_l1.report.time_tables import time_rows, time_table
 from torchrl_l1.report.training_tables import paired_rows, training_row
 from torchrl_l1.report.variants import Study
 
-__all__ = ["training_sections"]
-
 
 def training_sections(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
     """Everything that is known from the runs' own returns.

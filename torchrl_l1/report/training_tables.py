@@ -21,16 +21,6 @@ from torchrl_l1.report.statistics import (
 )
 from torchrl_l1.report.variants import Cell, Study, variant_text
 
-__all__ = [
-    "difference_summary",
-    "mean_summary",
-    "paired_rows",
-    "place_columns",
-    "run_rows",
-    "training_row",
-    "with_baselines",
-]
-
 
 def run_rows(study: Study) -> list[dict[str, Any]]:
     """One row per run, unfinished ones included."""

@@ -15,8 +15,6 @@ from torchrl_l1.report.settings import BASELINE
 from torchrl_l1.report.style import arm_label, color, fit_scale, grid, legend_below, save
 from torchrl_l1.report.variants import noise_order
 
-__all__ = ["plot_tuning", "tuning_rows"]
-
 Row = Mapping[str, Any]
 
 _WORDS = {

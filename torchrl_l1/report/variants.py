@@ -13,8 +13,6 @@ from torchrl_l1.report.duplicates import distinct
 from torchrl_l1.report.runs import Run
 from torchrl_l1.report.settings import BASELINE, NOISES, default_text
 
-__all__ = ["Cell", "Study", "noise_order", "studies", "variant_text"]
-
 Deviations = tuple[tuple[str, str], ...]
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from torchrl_l1.experiment import rendering
-from torchrl_l1.experiment.rendering import (
+from torchrl_l1.envs import rendering
+from torchrl_l1.envs.rendering import (
     RenderingUnavailable,
     animation,
     filmstrip,

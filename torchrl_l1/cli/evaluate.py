@@ -7,22 +7,80 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+from torchrl.envs import EnvBase
 from tqdm import tqdm
 
+from torchrl_l1.cli.robustness import plot_robustness, summarize, table
+from torchrl_l1.envs.rendering import (
+    RenderingUnavailable,
+    animation,
+    filmstrip,
+    rollout_frames,
+)
 from torchrl_l1.experiment.evaluate import (
+    Condition,
     TrainedRun,
     conditions,
     distinct,
     evaluate,
     load_run,
+    make_collection,
 )
-from torchrl_l1.experiment.filmstrip import write_filmstrip
 from torchrl_l1.experiment.l1_options import check_tuning
 from torchrl_l1.experiment.recipes import group_setting
-from torchrl_l1.experiment.robustness import plot_robustness, summarize, table
 from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.experiment.settings import RunSettings, WandbSettings
 from torchrl_l1.experiment.stages import KINDS
+
+_SECONDS_SHOWN = 4.0
+_COLUMNS = 10
+
+
+def write_filmstrip(
+    trained: TrainedRun,
+    cells: Sequence[Condition],
+    seed: int,
+    output: Path,
+) -> None:
+    """Render one deterministic episode per condition into ``filmstrip.png`` and ``.gif``.
+
+    The conditions share their disturbance; rows are named by their controllers, and by their
+    stages where there are several. Where no headless OpenGL works, a line says so and nothing is
+    written.
+    """
+    task = trained.algorithm.task
+    several = len({cell.stage for cell in cells}) > 1
+    steps = min(trained.recipe.horizon or task.horizon, round(_SECONDS_SHOWN / task.dt))
+    try:
+        rows = {
+            _label(cell, several): rollout_frames(task, _poses(trained, cell, steps, seed))
+            for cell in cells
+        }
+    except RenderingUnavailable as error:
+        print(f"No filmstrip: {error}")
+        return
+    strip = filmstrip(rows, output / "filmstrip.png", every=max(1, steps // _COLUMNS), dt=task.dt)
+    moving = animation(rows, output / "rollout.gif", dt=task.dt)
+    print(f"Filmstrip at bias {cells[0].bias:g}: {strip}, animation: {moving}")
+
+
+def _label(cell: Condition, several: bool) -> str:
+    """A line for each value that is set: a row is not wide."""
+    controller = "L1 " + cell.controller.replace(" ", "\n")
+    return f"{cell.stage}\n{controller}" if several else controller
+
+
+def _poses(trained: TrainedRun, cell: Condition, steps: int, seed: int) -> np.ndarray:
+    """Simulator positions ``(T, nq)`` of the first environment."""
+    poses: list[np.ndarray] = []
+
+    def record(env: EnvBase, _: object) -> None:
+        poses.append(env.base_env.simulator_state()[0][0])
+
+    collection = make_collection(trained, cell, 1)
+    collection.evaluate(seed, deterministic=True, steps=steps, callback=record)
+    return np.stack(poses)
 
 
 def _check_one_study(runs: Sequence[TrainedRun]) -> None:

@@ -8,12 +8,13 @@ from statistics import median
 from typing import Any
 
 import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
 from torchrl_l1.experiment.l1_options import controller_label
+
+matplotlib.use("Agg")
+
 
 _PANEL = ("stage", "policy", "noise")
 _CELL = (*_PANEL, "bias", "gain", "l1")

@@ -16,8 +16,6 @@ from PIL import Image, ImageDraw
 
 from torchrl_l1.envs import Task, get_task
 
-__all__ = ["RenderingUnavailable", "animation", "filmstrip", "rollout_frames"]
-
 _WORKER = Path(__file__).with_name("_render_worker.py")
 _TIMEOUT_SECONDS = 300
 

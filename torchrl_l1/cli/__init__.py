@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
             campaign_command(options, rest)
         elif options.command == "evaluate":
-            from torchrl_l1.experiment.evaluate_command import evaluate_command
+            from torchrl_l1.cli.evaluate import evaluate_command
 
             evaluate_command(options)
         elif options.command == "report":
@@ -166,7 +166,3 @@ def _run(options: argparse.Namespace, overrides: list[str]) -> None:
     from torchrl_l1.experiment.launch import launch
 
     launch(options.recipe, overrides + (["resume=true"] if options.resume else []))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,243 @@
+"""Batched MuJoCo simulation of a task, and the states that episodes start from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import Batch
+from torch import Tensor
+
+from torchrl_l1.envs.task import Task
+from torchrl_l1.envs.tasks import get_task
+
+# Beyond this magnitude MuJoCo itself calls a number bad (mjMAXVAL).
+MAX_MAGNITUDE = 1e10
+_BAD_STATE = [
+    int(mujoco.mjtWarning.mjWARN_BADQPOS),
+    int(mujoco.mjtWarning.mjWARN_BADQVEL),
+    int(mujoco.mjtWarning.mjWARN_BADQACC),
+]
+_NO_STAGE = int(mujoco.mjtStage.mjSTAGE_NONE)
+
+
+class BatchedSimulator:
+    """``num_envs`` simulations of one task.
+
+    Each keeps its whole integration state from step to step, solver warm start included, so that
+    trajectories are bit-equal to Gymnasium's. Copies and pickles continue where the original is.
+
+    Args:
+        task: the task to simulate.
+        num_envs: number of environments ``N``.
+        threads: threads that share the environments; results do not depend on it.
+
+    Attributes:
+        model: the compiled MuJoCo model.
+        batch: MuJoCo's own interface to all simulations (contacts, sensors, body poses, ...).
+        qpos: positions ``(N, nq)``, float64; a live view.
+        qvel: velocities ``(N, nv)``, float64; a live view.
+    """
+
+    def __init__(self, task: Task, num_envs: int, threads: int = 1) -> None:
+        self.task = task
+        self.num_envs = num_envs
+        self.threads = min(threads, num_envs)
+        self.model: mujoco.MjModel = task.build_model()
+        self._start()
+
+    def _start(self) -> None:
+        self.batch = Batch(self.model, self.num_envs, nthread=self.threads)
+        self.qpos: np.ndarray = self.batch.bind("qpos")
+        self.qvel: np.ndarray = self.batch.bind("qvel")
+        self._ctrl: np.ndarray = self.batch.bind("ctrl")
+
+    def __getstate__(self) -> dict[str, Any]:
+        kept = ("task", "num_envs", "threads", "model")
+        return {**{k: self.__dict__[k] for k in kept}, "rows": self.batch.state.copy()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        rows = state.pop("rows")
+        self.__dict__.update(state)
+        self._start()
+        self.batch.state[:] = rows
+
+    def set_state(
+        self, qpos: np.ndarray, qvel: np.ndarray, indices: Sequence[int] | np.ndarray | None = None
+    ) -> None:
+        """Puts environments into given states and forgets their history (time, warm start).
+
+        Args:
+            qpos: positions ``(K, nq)``.
+            qvel: velocities ``(K, nv)``.
+            indices: the ``K`` environments meant; all ``N`` by default.
+
+        Raises:
+            ValueError: if a shape is not the expected one or a number is not finite.
+        """
+        chosen = np.arange(self.num_envs) if indices is None else np.asarray(indices)
+        for name, value, size in (("qpos", qpos, self.model.nq), ("qvel", qvel, self.model.nv)):
+            if np.shape(value) != (len(chosen), size):
+                raise ValueError(
+                    f"{name} has shape {np.shape(value)}, expected {(len(chosen), size)}: "
+                    f"one row for each of the {len(chosen)} environments that are set."
+                )
+            if not np.isfinite(value).all():
+                raise ValueError(f"{name} has entries that are not finite.")
+        self.batch.reset(chosen, stage=_NO_STAGE)
+        self.qpos[chosen] = qpos
+        self.qvel[chosen] = qvel
+        self.batch.forward(chosen)
+
+    def step(self, control: np.ndarray) -> np.ndarray:
+        """Advances every environment by one environment step.
+
+        Where the simulation turns bad (MuJoCo's warnings of a bad position, velocity or
+        acceleration, upon which it silently restarts from the XML's pose), the environment is put
+        back to the state before the step.
+
+        Args:
+            control: actuator inputs ``(N, m)``, float64; MuJoCo clamps them where the XML says so.
+
+        Returns:
+            Boolean ``(N,)``: which environments turned bad.
+        """
+        batch = self.batch
+        before = batch.state.copy()
+        self._ctrl[:] = control
+        batch.step(nstep=self.task.frame_skip)
+        # MuJoCo checks at the start of a step: what the last one produced is unchecked. A maximum
+        # is NaN as soon as one entry is, and fails the comparison as well.
+        sound = np.abs(self.qpos).max() <= MAX_MAGNITUDE >= np.abs(self.qvel).max()
+        if sound and not batch.warning.any():
+            return np.zeros(self.num_envs, dtype=bool)
+        counts = batch.warning[:, _BAD_STATE, 1]  # of (last cause, count)
+        bad: np.ndarray = (counts > 0).any(1)
+        for values in (self.qpos, self.qvel):
+            bad |= ~(np.abs(values) <= MAX_MAGNITUDE).all(1)
+        indices = np.flatnonzero(bad)
+        batch.reset(indices, stage=_NO_STAGE)  # clears the warnings
+        batch.state[indices] = before[indices]
+        return bad
+
+
+class StartStates:
+    """Draws clean initial observations of a task, without stepping any physics.
+
+    Randomness follows torch's global generator, like the rest of an imagined rollout.
+
+    Args:
+        task: a key of :data:`~torchrl_l1.envs.TASKS`, or a :class:`~torchrl_l1.envs.Task`.
+
+    Examples:
+        >>> StartStates("half_cheetah")(8).shape
+        torch.Size([8, 17])
+    """
+
+    def __init__(self, task: str | Task) -> None:
+        self.task = get_task(task)
+        data = mujoco.MjData(self.task.build_model())
+        self._initial = (data.qpos.copy(), data.qvel.copy())
+
+    def __call__(self, count: int) -> Tensor:
+        """Initial observations ``(count, n)``, float32."""
+        seed = int(torch.randint(2**31, ()))
+        rng = np.random.default_rng(seed)
+        qpos, qvel = self.task.sample_reset(rng, *self._initial, count)
+        return torch.from_numpy(self.task.observe(qpos, qvel, qpos)).float()
+
+
+class TaskStep(NamedTuple):
+    """Outcome of a step: ``reward`` float64, ``terminated`` and ``bad`` bool, each ``(N,)``."""
+
+    reward: Tensor
+    terminated: Tensor
+    bad: Tensor
+
+
+class TaskSimulation:
+    """A task in ``num_envs`` simulations, without horizon, noise or random generator of its own.
+
+    Args:
+        task: the task.
+        num_envs: number of environments ``N``.
+        threads: threads that share the physics.
+
+    Attributes:
+        simulator: the physics.
+        observation: clean observations ``(N, n)``, float64. Every reset and step puts a new tensor
+            here; the old one is never written to.
+    """
+
+    def __init__(self, task: Task, num_envs: int, threads: int = 1) -> None:
+        self.task = task
+        self.simulator = BatchedSimulator(task, num_envs, threads)
+        data = mujoco.MjData(self.simulator.model)
+        self._initial = (data.qpos.copy(), data.qvel.copy())
+        self.observation = self._observe(self.simulator.qpos)
+
+    def _observe(self, previous_qpos: np.ndarray) -> Tensor:
+        simulator = self.simulator
+        # A copy: a task of a user may return the live positions themselves.
+        return torch.tensor(self.task.observe(simulator.qpos, simulator.qvel, previous_qpos))
+
+    def reset(self, rng: np.random.Generator, indices: np.ndarray) -> None:
+        """Starts new episodes in some environments and leaves the others alone."""
+        if indices.size:
+            qpos, qvel = self.task.sample_reset(rng, *self._initial, indices.size)
+            self.set_state(qpos, qvel, indices)
+
+    def set_state(
+        self, qpos: np.ndarray, qvel: np.ndarray, indices: np.ndarray | None = None
+    ) -> None:
+        """Starts new episodes from given states, in all environments or in some.
+
+        Raises:
+            ValueError: if a shape is wrong or a number is not finite.
+        """
+        self.simulator.set_state(qpos, qvel, indices)
+        started = np.arange(self.simulator.num_envs) if indices is None else indices
+        fresh = self._observe(self.simulator.qpos)
+        chosen = torch.zeros(len(fresh), 1, dtype=torch.bool)
+        chosen[started] = True
+        # The others keep entries that belong to the step they took.
+        self.observation = torch.where(chosen, fresh, self.observation)
+
+    def step(self, action: Tensor) -> TaskStep:
+        """Advances every environment by one environment step.
+
+        An environment whose simulation turns bad keeps its state and its observation.
+
+        Args:
+            action: ``(N, m)``; MuJoCo clamps it where the XML says so.
+
+        Raises:
+            ValueError: if the shape is wrong, or an entry is not finite or beyond 1e10.
+        """
+        action = self._checked(action)
+        before = self.simulator.qpos.copy()
+        bad = torch.from_numpy(self.simulator.step(action.numpy()))
+        previous, following = self.observation, self._observe(before)
+        if bad.any():
+            following = torch.where(bad.unsqueeze(-1), previous, following)
+        self.observation = following
+        reward = self.task.reward(previous, action, following)
+        return TaskStep(reward, self.task.terminated(following) | bad, bad)
+
+    def _checked(self, action: Tensor) -> Tensor:
+        expected = (self.simulator.num_envs, self.task.action_dim)
+        if tuple(action.shape) != expected:
+            raise ValueError(f"'action' has shape {tuple(action.shape)}, expected {expected}.")
+        action = action.detach().to(torch.float64)
+        magnitude = np.abs(action.numpy())
+        # Written so that NaN fails too; MuJoCo would replace such an input by zero.
+        if not magnitude.max() <= MAX_MAGNITUDE:
+            index = int(np.flatnonzero(~(magnitude <= MAX_MAGNITUDE).all(1))[0])
+            raise ValueError(
+                f"'action' of environment {index} is {action[index].tolist()}: every entry must "
+                f"be finite and at most {MAX_MAGNITUDE:g} in magnitude. Check the policy's output."
+            )
+        return action
