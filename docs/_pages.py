@@ -7,6 +7,8 @@ import pkgutil
 from pathlib import Path
 from typing import Any
 
+from torchrl_l1 import algorithms
+
 PACKAGES = (
     "control",
     "dynamics",
@@ -20,9 +22,9 @@ PACKAGES = (
 )
 
 
-def metrics_table(module: str) -> str:
+def metrics_table(algorithm: str) -> str:
     """Every metric that an algorithm logs, as a Markdown table."""
-    metrics = importlib.import_module(f"torchrl_l1.algorithms.{module}").METRICS
+    metrics = getattr(algorithms, algorithm).facts.metrics
     rows = [f"| `{name}` | {meaning} |" for name, meaning in metrics.items()]
     return "\n".join(["| Metric | Meaning |", "|---|---|", *rows, ""])
 
@@ -61,9 +63,9 @@ def resolve_public_name(app: Any, env: Any, node: Any, contnode: Any) -> Any:
 def write(folder: Path) -> None:
     """Write all generated pages; files that would not change are left alone."""
     pages = {f"api_{name}": api_page(name) for name in PACKAGES}
-    pages["metrics"] = metrics_table("metrpo_metrics")
-    pages["metrics_mbmf"] = metrics_table("mbmf_metrics")
-    pages["metrics_pets"] = metrics_table("pets")
+    pages["metrics"] = metrics_table("METRPO")
+    pages["metrics_mbmf"] = metrics_table("MBMF")
+    pages["metrics_pets"] = metrics_table("PETS")
     folder.mkdir(exist_ok=True)
     for name, text in pages.items():
         path = folder / f"{name}.md"

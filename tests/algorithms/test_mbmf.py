@@ -17,11 +17,12 @@ from torchrl_l1.algorithms import (
     Perturbation,
 )
 from torchrl_l1.algorithms.mbmf_config import ClonedPolicyConfig
-from torchrl_l1.algorithms.mbmf_metrics import METRICS
 from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.envs.perturbations import ActionNoise, ObservationNoise
 from torchrl_l1.planning import ShootingConfig
+
+METRICS = MBMF.facts.metrics
 
 L1 = L1Config(0.04, epsilon=0.2, action_low=-3.0, action_high=3.0)
 

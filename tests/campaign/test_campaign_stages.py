@@ -150,7 +150,7 @@ def test_steps_are_those_that_the_algorithm_counts(
     algorithm = OmegaConf.to_object(config).build()
     planned = PlannedRun({}, 0, 0, RunDirectory("unused"), config)
     counted = [result.metrics["real_steps"] for result in algorithm.iterate()]
-    random = algorithm.real.start.frames
+    random = algorithm.start.frames
     assert [planned.collected_steps(i) for i in range(planned.iterations + 1)] == [
         count - random for count in (random, *counted)
     ]

@@ -11,13 +11,15 @@ import pytest
 import torch
 from omegaconf import DictConfig
 
-from torchrl_l1.algorithms.pets import METRICS
+from torchrl_l1.algorithms import PETS
 from torchrl_l1.campaign.description import dump_yaml, read_campaign
 from torchrl_l1.campaign.plan import plan
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.evaluate import conditions, evaluate, load_run
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.run import run
+
+METRICS = PETS.facts.metrics
 
 TINY = [
     "outer_iterations=2",

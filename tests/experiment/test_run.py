@@ -17,9 +17,11 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 import torchrl_l1
-from torchrl_l1.algorithms.metrpo_metrics import METRICS
+from torchrl_l1.algorithms import METRPO
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError, save_atomically
+
+METRICS = METRPO.facts.metrics
 
 Recipe = Callable[..., DictConfig]
 

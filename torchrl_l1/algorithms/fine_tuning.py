@@ -21,6 +21,11 @@ from torchrl_l1.envs import Task
 _SAMPLED = "sampled"
 _LOG_PROB = "sampled_log_prob"
 
+FINE_TUNING_METRICS: dict[str, str] = {
+    "ppo/kl": "Stage 3: estimate of the KL divergence from the policy that collected, the mean "
+}
+"""What a round of fine-tuning reports."""
+
 
 @dataclass
 class FineTuningReport:
@@ -37,6 +42,15 @@ class FineTuningReport:
     clip_fraction: float
     value_loss: float
     explained_variance: float
+
+    def metrics(self) -> dict[str, float]:
+        """Metrics of a round."""
+        return {
+            "ppo/kl": self.kl,
+            "ppo/clip_fraction": self.clip_fraction,
+            "ppo/value_loss": self.value_loss,
+            "ppo/explained_variance": self.explained_variance,
+        }
 
 
 class FineTuning:

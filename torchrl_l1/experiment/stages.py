@@ -6,17 +6,15 @@ from collections.abc import Mapping
 
 from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModuleBase
 
-from torchrl_l1.algorithms import mbmf_metrics
+from torchrl_l1.algorithms import MBMF, METRPO, PETS
+from torchrl_l1.algorithms.facts import KINDS
 
 STAGES: Mapping[str, tuple[str, ...]] = {
-    "metrpo": ("policy",),
-    "pets": ("planner",),
-    "mbmf": mbmf_metrics.STAGES,
+    "metrpo": METRPO.facts.stage_names,
+    "pets": PETS.facts.stage_names,
+    "mbmf": MBMF.facts.stage_names,
 }
 """Stages in turn of each algorithm of the recipes."""
-
-KINDS = ("stochastic", "deterministic")
-"""The ways to act: with sampled actions, and with mean actions."""
 
 
 def find_stage(policies: Mapping[str, TensorDictModuleBase], stage: str | None) -> str:

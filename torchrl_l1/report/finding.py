@@ -91,7 +91,7 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
         algorithm = facts(identity.algorithm)
     except (KeyError, TypeError, ValueError) as error:
         raise RunDirectoryError(f"cannot use {directory.config_file}: {error}") from error
-    columns = read_metrics(directory.metrics_file, len(algorithm.stages))
+    columns = read_metrics(directory.metrics_file, len(algorithm.named_stages))
     iterations = len(columns["iteration"])
     if iterations > identity.outer_iterations:
         raise RunDirectoryError(
@@ -119,8 +119,8 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
         columns["return_deterministic"],
         {name: columns[name] for name in SIGNALS},
         readable(
-            partial(read_seconds, directory.timing_file, iterations, algorithm.phases),
-            {phase: np.full(iterations, np.nan) for phase in algorithm.phases},
+            partial(read_seconds, directory.timing_file, iterations, tuple(algorithm.phases)),
+            {phase: np.full(iterations, np.nan) for phase in tuple(algorithm.phases)},
         ),
         readable(partial(read_versions, path / "versions.json"), {}),
         {k: distinct_policies(tests, algorithm) for k, tests in evaluations.items() if tests},

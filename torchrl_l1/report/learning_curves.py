@@ -43,7 +43,7 @@ def plot_task(
     for noise, lines in _main_lines(study, task):
         heading = named(name, title(task, noise))
         authors = _authors(reference, task, noise)
-        earlier = len(study.facts.stages[:-1])
+        earlier = len(study.facts.named_stages[:-1])
         panels.append(Panel(heading, lines, authors, _stages(study, lines)[:earlier]))
     return plot_panels(panels, file)
 
@@ -147,7 +147,7 @@ def _stages(study: Study, lines: Sequence[Line]) -> list[Band]:
     """Where the stages are, in the run that is furthest; none where there is one stage only."""
     furthest = max((run for line in lines for run in line.runs), key=lambda run: len(run.returns))
     bands: list[Band] = []
-    for position, stage in enumerate(study.facts.stages):
+    for position, stage in enumerate(study.facts.named_stages):
         steps = furthest.real_steps[furthest.during(position)]
         if len(steps):
             bands.append(Band(stage.words, bands[-1].end if bands else 0.0, float(steps[-1])))

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_l1.report.algorithms import MEASURING, facts
+from torchrl_l1.algorithms.facts import MEASURING, WINDOW
+from torchrl_l1.report.algorithms import facts
 from torchrl_l1.report.reading import Evaluation
 from torchrl_l1.report.settings import Identity
-from torchrl_l1.report.statistics import WINDOW
 
 
 @dataclass
@@ -63,7 +63,7 @@ class Run:
         They are the last three, as in the paper; with several stages, those that the return of
         the last one is of: no other stage is mixed in.
         """
-        stages = facts(self.identity.algorithm).stages
+        stages = facts(self.identity.algorithm).named_stages
         if self.stage is None or not len(self.stage):
             return self.end_of(0, WINDOW)
         last = int(self.stage[-1]) - 1

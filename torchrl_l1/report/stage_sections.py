@@ -12,7 +12,7 @@ from torchrl_l1.report.variants import Study
 
 def stage_sections(page: Page, study: Study) -> None:
     """What each stage has reached, with L1 and without; nothing where there is one stage only."""
-    stages = study.facts.stages
+    stages = study.facts.named_stages
     rows = stage_rows(study)
     if not rows:
         return

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_l1.report.algorithms import StageFacts
+from torchrl_l1.algorithms.facts import Stage
 from torchrl_l1.report.runs import Run
 from torchrl_l1.report.settings import BASELINE
 from torchrl_l1.report.training_tables import (
@@ -31,7 +31,7 @@ def stage_rows(study: Study) -> list[dict[str, Any]]:
     """
     rows = []
     for cell, runs in study.cells.items():
-        for position, stage in enumerate(study.facts.stages):
+        for position, stage in enumerate(study.facts.named_stages):
             done = [run for run in runs if run.finished and run.during(position).any()]
             for policy in stage.policies if done else ():
                 returns = [stage_return(run, position, stage, policy) for run in done]
@@ -52,14 +52,14 @@ def stage_rows(study: Study) -> list[dict[str, Any]]:
     return rows
 
 
-def stage_return(run: Run, position: int, stage: StageFacts, policy: str) -> float:
+def stage_return(run: Run, position: int, stage: Stage, policy: str) -> float:
     """Mean return over the last outer iterations of a stage that the run has."""
     returns = run.returns if policy == "stochastic" else run.deterministic
     return float(returns[run.end_of(position, stage.window)].mean())
 
 
 def _differences(
-    study: Study, runs: Sequence[Run], position: int, stage: StageFacts, policy: str
+    study: Study, runs: Sequence[Run], position: int, stage: Stage, policy: str
 ) -> dict[str, Any]:
     if runs[0].identity.arm == BASELINE:
         return {}
@@ -79,7 +79,7 @@ def _steps(run: Run, position: int) -> float:
     return float(run.real_steps[run.end_of(position, 1)].item())
 
 
-def _signals(runs: Sequence[Run], position: int, stage: StageFacts) -> dict[str, float]:
+def _signals(runs: Sequence[Run], position: int, stage: Stage) -> dict[str, float]:
     found = {}
     for name, (signal, factor) in _SIGNALS.items():
         values = [run.signals[signal][run.end_of(position, stage.window)].mean() for run in runs]

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import bootstrap, t, trim_mean
 
-WINDOW = 3
-"""Outer iterations at the end of a run that its return is the mean of, as in the paper."""
+from torchrl_l1.algorithms.facts import WINDOW
 
 MIN_SAMPLES = 3
 """With fewer values than this there is no interval: the values themselves say more."""

@@ -37,10 +37,10 @@ def time_rows(study: Study) -> list[dict[str, Any]]:
         if cell.variant or not timed:
             continue
         place = {"task": cell.task, "noise": cell.noise, "l1": cell.arm}
-        if not study.facts.stages:
+        if not study.facts.named_stages:
             whole = [np.full(len(run.returns), True) for run in timed]
             rows.append({**place, "runs": len(timed), **_times(timed, whole, phases)})
-        for position, stage in enumerate(study.facts.stages):
+        for position, stage in enumerate(study.facts.named_stages):
             during = [run.during(position) for run in timed]
             if any(part.any() for part in during):
                 named = {**place, "stage": stage.name, "runs": len(timed)}

@@ -36,7 +36,7 @@ def _training(page: Page, study: Study, reference: ReferenceCurves | None) -> No
     page.heading(
         "Training",
         "Return is the mean over seeds of the mean over the last three outer iterations"
-        + " (fewer where the last stage has or counts fewer)" * bool(study.facts.stages)
+        + " (fewer where the last stage has or counts fewer)" * bool(study.facts.named_stages)
         + ", of sampled actions as in the paper" * study.facts.samples
         + "; the spread is the paper's ± (standard deviation over "
         "seeds in each of these iterations, averaged), the interval that of the mean over seeds. "
@@ -48,8 +48,8 @@ def _training(page: Page, study: Study, reference: ReferenceCurves | None) -> No
 
 
 def _l1_did(study: Study) -> str:
-    if study.facts.stages:
-        return f"L1 acts in {study.facts.stages[0].words} only; what it did is under Stages."
+    if study.facts.named_stages:
+        return f"L1 acts in {study.facts.named_stages[0].words} only; what it did is under Stages."
     return (
         "What L1 did (switches, mean norm of its input, share of actions that a bound cut) are "
         "means over the same iterations."
@@ -108,13 +108,13 @@ def _curves(page: Page, study: Study, reference: ReferenceCurves | None) -> None
 
 def _dashed(study: Study) -> str:
     places = study.facts.mean_action_stages
-    words = [stage.words for place, stage in enumerate(study.facts.stages) if place in places]
+    words = [stage.words for place, stage in enumerate(study.facts.named_stages) if place in places]
     where = f" in {' and '.join(words)}" if words else ""
     return f"; dashed: mean of the return with the mean action{where}" if places else ""
 
 
 def _bands(study: Study) -> str:
-    words = [stage.words for stage in study.facts.stages]
+    words = [stage.words for stage in study.facts.named_stages]
     if not words:
         return ""
     return f"; shaded: the stages before {words[-1]}, {' and '.join(words[:-1])}"
