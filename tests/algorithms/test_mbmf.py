@@ -192,7 +192,7 @@ def test_episodes_that_end_early_go_through_all_stages() -> None:
     assert all(math.isfinite(value) for metrics in results for value in metrics.values())
     # Each environment takes as many steps as a full episode has.
     assert results[-1]["real_steps"] == 40 * (2 + 4 + 1 + 4)
-    assert algorithm.real.practice.collect(0, 9)["next", "terminated"].any()
+    assert algorithm.practice.collect(0, 9)["next", "terminated"].any()
 
 
 def test_networks_are_saved_once_their_stage_has_begun() -> None:

@@ -70,7 +70,6 @@ class AlgorithmConfig(Protocol):
 class Surroundings(TypedDict, total=False):
     """What an algorithm takes beside its settings, see :class:`Algorithm`."""
 
-    perturbation: Perturbation | None
     seed: int
     horizon: int | None
     device: str
@@ -112,6 +111,7 @@ class Algorithm(ABC):
 
     facts: ClassVar[AlgorithmFacts]
     config_class: ClassVar[type[Any]]
+    config: AlgorithmConfig
     learning: ModelLearning
 
     def __init__(
@@ -119,15 +119,16 @@ class Algorithm(ABC):
         task: str,
         config: AlgorithmConfig,
         l1: L1Config | None = None,
+        perturbation: Perturbation | None = None,
         **surroundings: Unpack[Surroundings],
     ) -> None:
-        self.seed = surroundings.get("seed", 0)
+        self.config, self.seed = config, surroundings.get("seed", 0)
         self.device = resolve_device(surroundings.get("device", "cpu"))
         self.on_phase = surroundings.get("on_phase") or (lambda phase: None)
         self.task = get_task(task)
         self.horizon = surroundings.get("horizon") or self.task.horizon
         self.episode_steps = episode_length(config.episode_steps, self.horizon)
-        self.iteration, self._last_iteration = 0, config.outer_iterations
+        self.iteration = 0
         self._seconds: dict[str, float] = {}
 
         seed_streams(self.seed, "initialisation")
@@ -141,7 +142,7 @@ class Algorithm(ABC):
             self.task,
             dynamics=self.acting_dynamics,
             l1=l1,
-            perturbation=surroundings.get("perturbation") or Perturbation(),
+            perturbation=perturbation or Perturbation(),
             compile_l1=surroundings.get("compile_l1", False),
         )
 
@@ -160,7 +161,7 @@ class Algorithm(ABC):
 
     def rounds(self) -> Iterator[int]:
         """The outer iterations that are left, each on random streams and a clock of its own."""
-        while self.iteration < self._last_iteration:
+        while self.iteration < self.config.outer_iterations:
             seed_streams(self.seed, "iteration", self.iteration)
             self._seconds = dict.fromkeys(self.facts.phases, 0.0)
             yield self.iteration

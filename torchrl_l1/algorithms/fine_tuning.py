@@ -23,6 +23,11 @@ _LOG_PROB = "sampled_log_prob"
 
 FINE_TUNING_METRICS: dict[str, str] = {
     "ppo/kl": "Stage 3: estimate of the KL divergence from the policy that collected, the mean "
+    "difference of log-densities, last pass, nats. It may be slightly negative.",
+    "ppo/clip_fraction": "Stage 3: share of likelihood ratios beyond the bound, last pass.",
+    "ppo/value_loss": "Stage 3: squared error of the value network, last pass.",
+    "ppo/explained_variance": "Stage 3: share of the variance of the value targets that the "
+    "network explains, last pass.",
 }
 """What a round of fine-tuning reports."""
 

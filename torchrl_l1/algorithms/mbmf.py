@@ -38,6 +38,7 @@ from torchrl_l1.algorithms.mbmf_config import STAGES, MBMFConfig
 from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.policy import GaussianPolicy, acting
 from torchrl_l1.control import L1Config
+from torchrl_l1.envs import Perturbation
 from torchrl_l1.planning import ModelPredictiveController, ShootingConfig
 
 
@@ -48,6 +49,7 @@ class MBMF(Algorithm):
         task: name of a task, see :data:`torchrl_l1.envs.TASKS`.
         config: settings.
         l1: the adaptive controller around the planner; ``None`` for none.
+        perturbation: noise and disturbances of the real environments.
         **surroundings: see :class:`~torchrl_l1.algorithms.Algorithm`.
 
     Attributes:
@@ -61,6 +63,7 @@ class MBMF(Algorithm):
     """
 
     config_class = MBMFConfig
+    config: MBMFConfig
     facts = AlgorithmFacts(
         name="MBMF",
         stages=STAGES,
@@ -99,10 +102,10 @@ class MBMF(Algorithm):
         task: str,
         config: MBMFConfig,
         l1: L1Config | None = None,
+        perturbation: Perturbation | None = None,
         **surroundings: Unpack[Surroundings],
     ) -> None:
-        super().__init__(task, config, l1, **surroundings)
-        self.config = config
+        super().__init__(task, config, l1, perturbation, **surroundings)
         n, m = self.task.observation_dim, self.task.action_dim
         self.planner = self._planner(config.shooting)
         # In a state that the policy has visited there is no previous plan; the middle of the

@@ -32,6 +32,7 @@ from torchrl_l1.algorithms.policy_improvement import (
     policy_metrics,
 )
 from torchrl_l1.control import L1Config
+from torchrl_l1.envs import Perturbation
 
 
 class METRPO(Algorithm):
@@ -41,6 +42,7 @@ class METRPO(Algorithm):
         task: name of a task, see :data:`torchrl_l1.envs.TASKS`.
         config: settings.
         l1: the adaptive controller used in collection; ``None`` for none.
+        perturbation: noise and disturbances of the real environments.
         **surroundings: see :class:`~torchrl_l1.algorithms.Algorithm`.
 
     Raises:
@@ -48,6 +50,7 @@ class METRPO(Algorithm):
     """
 
     config_class = METRPOConfig
+    config: METRPOConfig
     facts = AlgorithmFacts(
         name="METRPO",
         stages=(Stage("policy"),),
@@ -82,11 +85,11 @@ class METRPO(Algorithm):
         task: str,
         config: METRPOConfig,
         l1: L1Config | None = None,
+        perturbation: Perturbation | None = None,
         **surroundings: Unpack[Surroundings],
     ) -> None:
         check_clipping(config.clip_actions, l1 is not None)
-        super().__init__(task, config, l1, **surroundings)
-        self.config = config
+        super().__init__(task, config, l1, perturbation, **surroundings)
         n, m = self.task.observation_dim, self.task.action_dim
         self.policy = GaussianPolicy(n, m, config.policy.hidden, config.policy.std).to(self.device)
         self.improvement = PolicyImprovement(self.task, self.dynamics, self.policy, config)

@@ -29,6 +29,7 @@ from torchrl_l1.algorithms.facts import AlgorithmFacts, Stage
 from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.pets_config import PETSConfig
 from torchrl_l1.control import L1Config
+from torchrl_l1.envs import Perturbation
 from torchrl_l1.planning import ModelPredictiveController
 
 
@@ -39,10 +40,12 @@ class PETS(Algorithm):
         task: name of a task, see :data:`torchrl_l1.envs.TASKS`.
         config: settings.
         l1: the adaptive controller used in collection; ``None`` for none.
+        perturbation: noise and disturbances of the real environments.
         **surroundings: see :class:`~torchrl_l1.algorithms.Algorithm`.
     """
 
     config_class = PETSConfig
+    config: PETSConfig
     facts = AlgorithmFacts(
         name="PETS",
         stages=(Stage("planner", policies=("stochastic",), is_planner=True),),
@@ -71,10 +74,10 @@ class PETS(Algorithm):
         task: str,
         config: PETSConfig,
         l1: L1Config | None = None,
+        perturbation: Perturbation | None = None,
         **surroundings: Unpack[Surroundings],
     ) -> None:
-        super().__init__(task, config, l1, **surroundings)
-        self.config = config
+        super().__init__(task, config, l1, perturbation, **surroundings)
         self.policy = ModelPredictiveController(
             make_sampler(config, self.dynamics, self.task, common_noise=config.common_noise),
             config.cem,
