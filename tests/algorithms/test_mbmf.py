@@ -16,6 +16,7 @@ from torchrl_l1.algorithms import (
     ModelConfig,
     Perturbation,
 )
+from torchrl_l1.algorithms.collection import Collection
 from torchrl_l1.algorithms.mbmf_config import ClonedPolicyConfig
 from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.dynamics import FitConfig
@@ -165,7 +166,7 @@ def test_only_fresh_plans_are_cloned_and_what_was_planned_not_what_acted() -> No
 def test_noise_is_in_all_stages_and_l1_around_the_planner_alone() -> None:
     perturbation = Perturbation(action_noise=0.1, observation_noise=0.2)
     algorithm = MBMF("inverted_pendulum", tiny(), L1, perturbation, horizon=10)
-    stages = vars(algorithm.real)
+    stages = {k: v for k, v in vars(algorithm).items() if isinstance(v, Collection)}
     assert len(stages) == 7
     for name, collection in stages.items():
         kinds = {type(transform) for transform in collection.env.transform}

@@ -9,7 +9,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
 from time import perf_counter
-from typing import Any, ClassVar, Protocol, TypedDict, Unpack
+from typing import Any, ClassVar, Protocol, TypedDict
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -120,13 +120,18 @@ class Algorithm(ABC):
         config: AlgorithmConfig,
         l1: L1Config | None = None,
         perturbation: Perturbation | None = None,
-        **surroundings: Unpack[Surroundings],
+        *,
+        seed: int = 0,
+        horizon: int | None = None,
+        device: str = "cpu",
+        compile_l1: CompileMode = False,
+        on_phase: Callable[[str], None] | None = None,
     ) -> None:
-        self.config, self.seed = config, surroundings.get("seed", 0)
-        self.device = resolve_device(surroundings.get("device", "cpu"))
-        self.on_phase = surroundings.get("on_phase") or (lambda phase: None)
+        self.config, self.seed = config, seed
+        self.device = resolve_device(device)
+        self.on_phase = on_phase or (lambda phase: None)
         self.task = get_task(task)
-        self.horizon = surroundings.get("horizon") or self.task.horizon
+        self.horizon = horizon or self.task.horizon
         self.episode_steps = episode_length(config.episode_steps, self.horizon)
         self.iteration = 0
         self._seconds: dict[str, float] = {}
@@ -143,7 +148,7 @@ class Algorithm(ABC):
             dynamics=self.acting_dynamics,
             l1=l1,
             perturbation=perturbation or Perturbation(),
-            compile_l1=surroundings.get("compile_l1", False),
+            compile_l1=compile_l1,
         )
 
     @abstractmethod
