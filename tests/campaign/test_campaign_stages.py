@@ -70,9 +70,10 @@ def test_stages_are_evaluated_where_the_campaign_says_so(
     described = load_yaml(this.directory.path / "evaluations/frozen.yaml")
     assert described["stage"] == ["shooting", "fine_tuning"]
     assert "after 80 real steps" in capsys.readouterr().out
-    assert is_evaluated(this.directory, this.evaluations[0])
+    (settings,) = this.evaluations
+    assert is_evaluated(this.directory, settings)
     assert not is_evaluated(
-        this.directory, replace(this.evaluations[0], matrix={"stage": ["shooting"]})
+        this.directory, replace(settings, matrix=settings.matrix | {"stage": ["shooting"]})
     )
 
 

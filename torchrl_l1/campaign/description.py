@@ -155,7 +155,11 @@ class EvaluationSettings:
             raise CampaignError(f"where must map keys to lists of values, got {self.where!r}")
         for key, values in self.where.items():
             _check_list(f"where.{key}", values, (str, int, float), filled=True)
-        self.matrix = {axis.name: _axis_values(axis, self.matrix) for axis in axes()}
+        every = axes()
+        for key in self.matrix:
+            if key not in [axis.name for axis in every]:
+                raise CampaignError(f"an evaluation does not vary {key!r}")
+        self.matrix = {axis.name: _axis_values(axis, self.matrix) for axis in every}
         for key, least in (("episodes", 1), ("seed", 0)):
             value = getattr(self, key)
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
@@ -305,9 +309,9 @@ def read_campaign(name: str, overrides: Sequence[str] = ()) -> Campaign:
     for key in ("runs", "evaluations"):
         if not isinstance(content.get(key, []), list) or content.get(key, [None]) == []:
             raise CampaignError(f"{file}: {key} must be a list with at least one entry")
-    keys = tuple(part.name for part in fields(RunMatrix))
+    parts = [part.name for part in fields(RunMatrix)]
     runs = [
-        _build(RunMatrix, file, f"runs[{i}]", entry, keys, "recipe")
+        _build(RunMatrix, file, f"runs[{i}]", entry, parts, "recipe")
         for i, entry in enumerate(content["runs"])
     ]
     for i, matrix in enumerate(runs):
