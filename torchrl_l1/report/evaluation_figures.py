@@ -150,7 +150,8 @@ def plot_disturbances(
     if not found:
         return None
     # All panels of a column vary the same; returns and differences take turns down the rows.
-    columns = len({what for _, what, _ in found})
+    # A single disturbance with nothing below it has room for two beside each other.
+    columns = max(len({what for _, what, _ in found}), 2 // len(shown))
     groups = [found[i : i + columns] for i in range(0, len(found), columns)]
     panels = [
         (name, what, chosen, value)
