@@ -112,7 +112,7 @@ def _evaluate_parser(
         "disturbance and stochastic or deterministic policy. Several run directories are seeds of "
         "one study.",
     )
-    # Torch is loaded for the options of the command that is asked for, and for no other.
+    # They come with all that evaluates and draws; no other command should wait for it.
     if asked:
         from torchrl_l1.cli.evaluate import add_arguments
 
