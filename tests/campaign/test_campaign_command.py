@@ -180,7 +180,9 @@ def test_evaluation_sweeps_epsilon_and_alpha(campaign_file: Path) -> None:
     assert is_evaluated(this.directory, settings)
     rows = [(row["l1"], row["epsilon"], row["alpha"]) for row in table(this, "tuning")]
     assert rows == [("off", "", ""), ("paper", "0.5", "0.1"), ("paper", "2.0", "0.1")]
-    assert not is_evaluated(this.directory, replace(settings, alpha=[0.2]))
+    assert not is_evaluated(
+        this.directory, replace(settings, matrix=settings.matrix | {"alpha": [0.2]})
+    )
 
 
 def path_of(this: PlannedRun, name: str) -> Path:

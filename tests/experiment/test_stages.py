@@ -14,8 +14,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_l1.cli import evaluate as evaluate_command
 from torchrl_l1.cli import main
-from torchrl_l1.experiment.evaluate import Condition, TrainedRun, evaluate, load_run
+from torchrl_l1.experiment.evaluate import TrainedRun, evaluate, load_run
 from torchrl_l1.experiment.launch import compose
+from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.settings import SCHEMAS
 from torchrl_l1.experiment.stages import KINDS, STAGES, kinds_of
@@ -105,7 +106,7 @@ def test_each_stage_is_evaluated_on_its_own(
 def test_last_stage_is_the_default_and_is_named(trained: Path) -> None:
     loaded = load_run(trained)
     default, named, other = (
-        next(evaluate(loaded, [Condition("off", "none", 0.0, 1.0, "stochastic", stage=name)], 2))
+        next(evaluate(loaded, [Condition("off", stage=name)], 2))
         for name in (None, "fine_tuning", "cloning")
     )
     assert default["stage"] == named["stage"] == "fine_tuning"
@@ -162,7 +163,7 @@ def test_runs_with_compiled_plans_are_evaluated_without(tmp_path: Path) -> None:
 
 def test_rows_of_a_single_stage_are_as_they_were(tiny_recipe: Callable[..., DictConfig]) -> None:
     loaded = load_run(run(tiny_recipe("outer_iterations=1")))
-    cell = Condition("off", "none", 0.0, 1.0, "stochastic")
+    cell = Condition("off")
     (row,) = evaluate(loaded, [cell], 2)
     assert "stage" not in row
     with pytest.raises(ValueError, match="no stage 'shooting', or not yet; there is policy"):

@@ -6,6 +6,7 @@ import csv
 import random
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +26,10 @@ from torchrl_l1.report.algorithm_tables import (
     differing_settings,
 )
 from torchrl_l1.report.algorithms import ALGORITHMS, facts
-from torchrl_l1.report.evaluation_tables import evaluation_rows
+from torchrl_l1.report.evaluation_data import Evaluation, one_policy
+from torchrl_l1.report.evaluations import evaluation_rows
 from torchrl_l1.report.finding import find_runs
 from torchrl_l1.report.learning_curves import plot_algorithms
-from torchrl_l1.report.reading import Evaluation, one_policy
 from torchrl_l1.report.style import noise_words, title
 from torchrl_l1.report.time_tables import time_rows, time_table
 from torchrl_l1.report.training_tables import paired_rows, run_rows, training_row
@@ -350,9 +351,9 @@ def test_tests_of_one_way_to_act_count_once_however_named(
 
 
 def test_other_algorithms_keep_both_policies_and_repetitions_merge() -> None:
-    first = Evaluation("off", "none", 0.0, 1.0, "deterministic", -1.0, 10)
-    second = Evaluation("off", "none", 0.0, 1.0, "stochastic", -2.0, 10)
-    other = Evaluation("off", "none", 1.0, 1.0, "deterministic", -3.0, 10)
+    first = Evaluation(l1="off", policy="deterministic", return_mean=-1.0, episodes=10)
+    second = replace(first, policy="stochastic", return_mean=-2.0)
+    other = replace(first, disturbances={"bias": 1.0}, return_mean=-3.0)
     found = one_policy([first, second, other])
     assert [(test.policy, test.return_mean) for test in found] == [
         ("stochastic", -2.0),

@@ -17,7 +17,7 @@ from scipy.stats import t
 from torchrl_l1.experiment.run_directory import RunDirectoryError
 from torchrl_l1.experiment.stages import STAGES as ALL_STAGES
 from torchrl_l1.report import curve_panels, evaluation_figures, report
-from torchrl_l1.report.evaluation_tables import evaluation_rows
+from torchrl_l1.report.evaluations import evaluation_rows
 from torchrl_l1.report.finding import find_readable_runs, find_runs
 from torchrl_l1.report.learning_curves import plot_stages, plot_task
 from torchrl_l1.report.stage_tables import stage_rows

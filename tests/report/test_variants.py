@@ -94,7 +94,10 @@ def test_equal_runs_share_their_evaluations(write_run: WriteRun, tmp_path: Path)
     study = Study(find_runs([tmp_path]))
     (run,) = study.runs
     assert run.path.name == "a"
-    biases = {name: [test.bias for test in found] for name, found in run.evaluations.items()}
+    biases = {
+        name: [test.disturbances["bias"] for test in found]
+        for name, found in run.evaluations.items()
+    }
     assert biases == {"mine": [0.0, 1.0], "ablation": [0.0], "late": [3.0]}
     assert sorted(run.path.name for run in study.duplicates) == ["b", "c", "d", "e"]
 

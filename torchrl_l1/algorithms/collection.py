@@ -79,10 +79,7 @@ def make_pipeline(
     return make_env(
         task,
         num_envs,
-        action_noise=perturbation.action_noise,
-        observation_noise=perturbation.observation_noise,
-        actuator_bias=perturbation.actuator_bias,
-        actuator_gain=perturbation.actuator_gain,
+        **vars(perturbation),
         max_steps=horizon,
         extra_transforms=[RewardSum(), *controller, *extra],
     )

@@ -224,7 +224,7 @@ def _add_evaluations(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
         place = f"{campaign.file}: evaluations[{i}] ({settings.name})"
         try:
             for group in ("l1", "noise"):
-                for option in getattr(settings, group):
+                for option in settings.matrix[group]:
                     group_setting(group, option)
         except ValueError as error:
             raise CampaignError(f"{place}: {error}") from error
@@ -242,7 +242,7 @@ def _add_evaluations(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
         if not chosen:
             raise CampaignError(f"{place}: no run has all of where")
         for run in chosen:
-            _check_stages(place, run, settings.stage)
+            _check_stages(place, run, settings.matrix["stage"])
             if any(other.name == settings.name for other in run.evaluations):
                 raise CampaignError(
                     f"{place}: another evaluation of this name is for {run} too; give it another "

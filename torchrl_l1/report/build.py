@@ -9,7 +9,7 @@ from typing import Any
 from torchrl_l1.experiment.run_directory import write_atomically
 from torchrl_l1.report.algorithm_sections import algorithm_sections
 from torchrl_l1.report.campaigns import find_campaigns
-from torchrl_l1.report.evaluation_sections import evaluation_sections
+from torchrl_l1.report.evaluations import evaluation_sections
 from torchrl_l1.report.finding import Findings, find_readable_runs
 from torchrl_l1.report.page import Page
 from torchrl_l1.report.reference_curves import ReferenceCurves

@@ -12,15 +12,18 @@ import numpy as np
 
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError, run_directories
 from torchrl_l1.report.algorithms import facts
-from torchrl_l1.report.reading import (
-    SIGNALS,
+from torchrl_l1.report.evaluation_data import (
+    Evaluation,
     distinct_policies,
     read_evaluations,
+)
+from torchrl_l1.report.reading import (
+    SIGNALS,
     read_metrics,
     read_seconds,
     read_versions,
 )
-from torchrl_l1.report.runs import Evaluation, Run
+from torchrl_l1.report.runs import Run
 from torchrl_l1.report.settings import identify
 
 T = TypeVar("T")

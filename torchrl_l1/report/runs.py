@@ -11,7 +11,7 @@ import numpy as np
 
 from torchrl_l1.algorithms.facts import MEASURING, WINDOW
 from torchrl_l1.report.algorithms import facts
-from torchrl_l1.report.reading import Evaluation
+from torchrl_l1.report.evaluation_data import Evaluation
 from torchrl_l1.report.settings import Identity
 
 

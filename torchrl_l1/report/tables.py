@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
+
+Row = Mapping[str, Any]
 
 
 def number(value: float | None) -> str:
@@ -54,3 +57,52 @@ class Footnotes:
     def text(self) -> str:
         """The notes, a line each."""
         return "\n".join(f"- †{index}: {note}." for note, index in self._notes.items())
+
+
+def grouped(
+    rows: Sequence[Row], keys: Sequence[str], inner: str
+) -> list[tuple[tuple[Any, ...], dict[str, Row]]]:
+    """Rows by their values of some keys, and each group by its values of another one."""
+    groups: dict[tuple[Any, ...], dict[str, Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row.get(key, "") for key in keys), {})[row[inner]] = row
+    return list(groups.items())
+
+
+def with_interval(row: Row | None) -> str:
+    """A mean with its standard deviation and 95 % interval, as far as there are enough seeds."""
+    if row is None:
+        return "–"
+    seeds = row["seeds"] if "seeds" in row else row["training_seeds"]
+    spread = spread_text(row["return_mean"], row["std"] if seeds > 1 else None)
+    return f"{spread} {interval_of(row, 'return')}".removesuffix(" –")
+
+
+def less_off(row: Row) -> str:
+    """The mean difference to the baseline with its interval; single ones where there are few."""
+    values = str(row.get("differences", "")).split()
+    if row.get("difference_low") is None:
+        return ", ".join(number(float(value)) for value in values) or "–"
+    return f"{number(row['difference_mean'])} {interval_of(row, 'difference')}"
+
+
+def interval_of(row: Row, name: str) -> str:
+    """The interval of a value of a row, or a dash."""
+    return interval_text(row.get(f"{name}_low"), row.get(f"{name}_high"))
+
+
+def spread_text(mean: float | None, spread: float | None) -> str:
+    """A mean, with its spread if that is known."""
+    return number(mean) if spread is None else f"{number(mean)} ± {number(spread)}"
+
+
+def paper_text(row: Row, notes: Footnotes) -> str:
+    """The published value, its erratum among the notes."""
+    if row.get("paper_mean") is None:
+        return "–"
+    return f"{row['paper_mean']} ± {row['paper_std']}{notes.mark(row['paper_erratum'])}"
+
+
+def with_notes(table: str, notes: Footnotes) -> str:
+    """A table with its notes below."""
+    return f"{table}\n\n{notes.text()}".rstrip()
