@@ -14,8 +14,8 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.stats import t
 
+from torchrl_l1.algorithms import MBMF
 from torchrl_l1.experiment.run_directory import RunDirectoryError
-from torchrl_l1.experiment.stages import STAGES as ALL_STAGES
 from torchrl_l1.report import curve_panels, evaluation_figures, report
 from torchrl_l1.report.evaluations import evaluation_rows
 from torchrl_l1.report.finding import find_readable_runs, find_runs
@@ -318,7 +318,7 @@ def test_ablation_tells_planners_from_policies(write_mbmf: WriteRun, tmp_path: P
     section = page.split("\n## Ablation\n")[1].split("\n## ")[0]
     tables = re.findall(r"^L1 paper(.*):\n\n((?:\|.*\n)+)", section, re.MULTILINE)
     found = [
-        (words, [name for name in ALL_STAGES["mbmf"] if f"| {name} |" in text])
+        (words, [name for name in MBMF.facts.stage_names if f"| {name} |" in text])
         for words, text in tables
     ]
     assert found == [

@@ -26,8 +26,7 @@ from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run import check_mode
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
-from torchrl_l1.experiment.settings import RunSettings, compile_mode, l1_config
-from torchrl_l1.experiment.stages import STAGES
+from torchrl_l1.experiment.settings import SCHEMAS, RunSettings, compile_mode, l1_config
 
 
 @dataclass
@@ -252,7 +251,8 @@ def _add_evaluations(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
 
 
 def _check_stages(place: str, run: PlannedRun, asked: Sequence[str]) -> None:
-    every, reached = STAGES[run.config.algorithm], run.stages()
+    every = SCHEMAS[run.config.algorithm].builds.facts.stage_names
+    reached = run.stages()
     for name in asked:
         if name not in every:
             raise CampaignError(

@@ -16,6 +16,7 @@ from torchrl_l1.algorithms.collection import (
     return_metrics,
     signal_metrics,
 )
+from torchrl_l1.algorithms.policy import kinds_of
 from torchrl_l1.envs import DISTURBANCES, Perturbation
 from torchrl_l1.experiment.l1_options import (
     closest_option,
@@ -26,7 +27,6 @@ from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError, read_config
 from torchrl_l1.experiment.settings import L1Settings, RunSettings, l1_config, schema_of
-from torchrl_l1.experiment.stages import STAGES, find_stage, kinds_of
 
 
 @dataclass
@@ -38,15 +38,20 @@ class TrainedRun:
     algorithm: Algorithm
 
     def stage(self, name: str | None) -> str:
-        """The name of a stage that the run has reached, see :func:`find_stage`.
+        """The name of a stage that the run has reached; of the last one if ``None``.
 
         Raises:
             ValueError: if there is no such stage, or not yet, with the run and those it has.
         """
-        try:
-            return find_stage(self.algorithm.policies, name)
-        except ValueError as error:
-            raise ValueError(f"{self.path}: {error}") from error
+        reached = list(self.algorithm.policies)
+        if name is None:
+            return reached[-1]
+        if name not in reached:
+            there = "there are" if len(reached) > 1 else "there is"
+            raise ValueError(
+                f"{self.path}: no stage {name!r}, or not yet; {there} {', '.join(reached)}"
+            )
+        return name
 
 
 def load_run(path: str | Path) -> TrainedRun:
@@ -140,7 +145,7 @@ def make_collection(trained: TrainedRun, cell: Condition, episodes: int) -> Coll
 
 def _columns(trained: TrainedRun, cell: Condition) -> dict[str, Any]:
     columns = cell.columns()
-    if len(STAGES[trained.recipe.algorithm]) == 1:
+    if not trained.algorithm.facts.named_stages:
         del columns["stage"]  # there is no choice, and nothing to say
     return columns
 

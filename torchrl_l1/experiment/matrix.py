@@ -12,9 +12,12 @@ from dataclasses import dataclass, field, fields
 from itertools import product
 from typing import Any
 
+from torchrl_l1.algorithms.facts import KINDS
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.l1_options import check_tuning, controller_label
-from torchrl_l1.experiment.stages import KINDS, STAGES
+from torchrl_l1.experiment.settings import SCHEMAS
+
+_STAGES = [stage.name for one in SCHEMAS.values() for stage in one.builds.facts.named_stages]
 
 # Key of the metadata of a field.
 _AXIS = "axis"
@@ -95,7 +98,7 @@ class Condition:
     stage: str | None = _varied(
         str,
         "stages whose policies are tested, of algorithms with several "
-        f"({', '.join(name for names in STAGES.values() if len(names) > 1 for name in names)}); "
+        f"({', '.join(_STAGES)}); "
         "the last that there is by default",
         default=None,
     )
