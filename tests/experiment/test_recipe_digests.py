@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,6 @@ from torchrl_l1.experiment.recipes import (
 )
 
 FILE = Path(__file__).with_name("recipe_digests.json")
-PLACE = Path("/runs")
 
 
 def digest(*settings: DictConfig) -> str:
@@ -33,28 +33,30 @@ def digest(*settings: DictConfig) -> str:
 
 def presets(recipe: str) -> list[str]:
     """Those that a recipe finds: of its folder, its algorithm and all."""
-    algorithm = compose(recipe, ["run_dir=unused"]).algorithm
+    algorithm = composed(recipe).algorithm
     folders = {find_recipe(recipe).parent, recipes_dir() / algorithm, recipes_dir() / "shared"}
     return sorted({file.stem for folder in folders for file in folder.glob("preset/*.yaml")})
 
 
 def of_recipe(name: str) -> dict[str, str]:
-    return {
-        preset: digest(compose(name, [f"preset={preset}", f"run_dir={PLACE}"]))
-        for preset in presets(name)
-    }
+    return {preset: digest(composed(name, f"preset={preset}")) for preset in presets(name)}
 
 
 def of_campaign(name: str) -> dict[str, str]:
-    """Of the file, and of its runs but for their seeds, which the file has."""
+    """Of the file, and of the runs in the first and in the last cell of each matrix."""
     campaign = read_campaign(name)
-    place = f"run_dir={PLACE}"
-    runs = [
-        compose(matrix.recipe, [*matrix.overrides, *(f"{key}={cell[key]}" for key in cell), place])
-        for matrix in campaign.runs
-        for cell in cells(matrix)
-    ]
+    runs = []
+    for matrix in campaign.runs:
+        first, *_, last = [*cells(matrix)] * 2
+        for cell in (first, last):
+            place = (f"{key}={value}" for key, value in cell.items())
+            runs.append(composed(matrix.recipe, *matrix.overrides, *place))
     return {"file": digest(OmegaConf.create(campaign.to_dict())), "runs": digest(*runs)}
+
+
+@cache
+def composed(recipe: str, *overrides: str) -> DictConfig:
+    return compose(recipe, [*overrides, "run_dir=/run"])
 
 
 @pytest.mark.parametrize("name", available_recipes())
