@@ -11,7 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_l1.campaign.workers import Job, Stopped, Unfinished, Workers, available_cores
+from torchrl_l1.campaign.workers import (
+    TEMPORARY_FAILURE,
+    Job,
+    Stopped,
+    Unfinished,
+    Workers,
+    available_cores,
+)
 
 MakeJob = Callable[..., Job]
 
@@ -79,7 +86,7 @@ def test_tries_again_if_another_process_was_quicker(make_job: MakeJob, tmp_path:
     ended: list[str] = []
     # The first attempt finds that another process has the directory, which then ends at once: by
     # the time the workers look, nobody holds it any more.
-    script = f"test -e {started} || {{ touch {started}; exit {os.EX_TEMPFAIL}; }}"
+    script = f"test -e {started} || {{ touch {started}; exit {TEMPORARY_FAILURE}; }}"
     job = make_job(script, lambda: ended.append("done") or [])
     assert workers(1).work([job]) == []
     assert ended == ["done"]
