@@ -29,10 +29,10 @@ from torchrl_l1.report.evaluation_tables import evaluation_rows
 from torchrl_l1.report.finding import find_runs
 from torchrl_l1.report.learning_curves import plot_algorithms
 from torchrl_l1.report.reading import Evaluation, one_policy
+from torchrl_l1.report.study import noise_order, studies
 from torchrl_l1.report.style import noise_words, title
 from torchrl_l1.report.time_tables import time_rows, time_table
 from torchrl_l1.report.training_tables import paired_rows, run_rows, training_row
-from torchrl_l1.report.variants import noise_order, studies
 
 WriteRun = Callable[..., Path]
 RNG = np.random.default_rng(0)

@@ -21,9 +21,9 @@ from torchrl_l1.report.evaluation_tables import evaluation_rows
 from torchrl_l1.report.finding import find_readable_runs, find_runs
 from torchrl_l1.report.learning_curves import plot_stages, plot_task
 from torchrl_l1.report.stage_tables import stage_rows
+from torchrl_l1.report.study import Study, studies
 from torchrl_l1.report.time_tables import time_rows, time_table
 from torchrl_l1.report.training_tables import training_row
-from torchrl_l1.report.variants import Study, studies
 
 WriteRun = Callable[..., Path]
 

@@ -13,16 +13,16 @@ from scipy.stats import trim_mean
 from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.report.evaluation_tables import ablation_rows, evaluation_rows
 from torchrl_l1.report.finding import find_runs
+from torchrl_l1.report.page import markdown
 from torchrl_l1.report.rendering import (
     ablation_table,
     evaluation_table,
     paired_table,
     training_table,
 )
-from torchrl_l1.report.tables import markdown
+from torchrl_l1.report.study import Study
 from torchrl_l1.report.time_tables import time_rows, time_table
 from torchrl_l1.report.training_tables import paired_rows, run_rows, training_row
-from torchrl_l1.report.variants import Study
 
 WriteRun = Callable[..., Path]
 RNG = np.random.default_rng(0)

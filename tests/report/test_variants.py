@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchrl_l1.report.finding import find_runs
+from torchrl_l1.report.identity import Identity
 from torchrl_l1.report.runs import Run
-from torchrl_l1.report.settings import Identity
-from torchrl_l1.report.variants import Cell, Study, variant_text
+from torchrl_l1.report.study import Cell, Study, variant_text
 
 WriteRun = Callable[..., Path]
 

@@ -13,8 +13,8 @@ from torchrl_l1.report.algorithm_tables import (
 from torchrl_l1.report.learning_curves import plot_algorithms
 from torchrl_l1.report.page import Page
 from torchrl_l1.report.rendering import algorithm_pairs_table, algorithm_table
+from torchrl_l1.report.study import Study
 from torchrl_l1.report.style import title
-from torchrl_l1.report.variants import Study
 
 
 def algorithm_sections(page: Page, studies: Sequence[Study]) -> None:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from torchrl_l1.report.identity import BASELINE
 from torchrl_l1.report.runs import Run
-from torchrl_l1.report.settings import BASELINE
+from torchrl_l1.report.statistics import difference_summary
+from torchrl_l1.report.study import Cell, Study, noise_order
 from torchrl_l1.report.style import algorithm_label
-from torchrl_l1.report.training_tables import difference_summary, training_row
-from torchrl_l1.report.variants import Cell, Study, noise_order
+from torchrl_l1.report.training_tables import training_row
 
 # Of a row of the training, what can be compared.
 _KEYS = (

@@ -13,9 +13,9 @@ from torchrl_l1.report.evaluation_sections import evaluation_sections
 from torchrl_l1.report.finding import Findings, find_readable_runs
 from torchrl_l1.report.page import Page
 from torchrl_l1.report.reference_curves import ReferenceCurves
+from torchrl_l1.report.study import Study, studies
 from torchrl_l1.report.training_sections import training_sections
 from torchrl_l1.report.training_tables import run_rows
-from torchrl_l1.report.variants import Study, studies
 
 
 def report(

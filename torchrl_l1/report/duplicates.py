@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchrl_l1.report.runs import Evaluation, Run
+from torchrl_l1.report.reading import Evaluation
+from torchrl_l1.report.runs import Run
 
 
 def distinct(runs: Sequence[Run], same: Callable[[Run], Hashable]) -> tuple[list[Run], list[Run]]:

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 
 from torchrl_l1.report.algorithms import AlgorithmFacts
 from torchrl_l1.report.evaluation_tables import PHASES
+from torchrl_l1.report.study import noise_order
 from torchrl_l1.report.style import (
     arm_label,
     color,
@@ -21,7 +22,6 @@ from torchrl_l1.report.style import (
     save,
     title,
 )
-from torchrl_l1.report.variants import noise_order
 
 Row = Mapping[str, Any]
 

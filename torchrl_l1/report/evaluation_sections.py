@@ -8,12 +8,12 @@ from typing import Any
 from torchrl_l1.report.algorithms import AlgorithmFacts
 from torchrl_l1.report.evaluation_figures import plot_ablation, plot_disturbances
 from torchrl_l1.report.evaluation_tables import ablation_rows, evaluation_names, evaluation_rows
+from torchrl_l1.report.identity import BASELINE
 from torchrl_l1.report.page import Page
 from torchrl_l1.report.rendering import ablation_table, evaluation_table, tuning_table
-from torchrl_l1.report.settings import BASELINE
+from torchrl_l1.report.study import Study
 from torchrl_l1.report.style import arm_label, named, noise_words, title
 from torchrl_l1.report.tuning_figures import plot_tuning, tuning_rows
-from torchrl_l1.report.variants import Study
 
 Row = Mapping[str, Any]
 Section = Callable[[Page, AlgorithmFacts, Sequence[Row]], None]

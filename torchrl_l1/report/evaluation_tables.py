@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from torchrl_l1.report.algorithms import facts
+from torchrl_l1.report.identity import BASELINE
 from torchrl_l1.report.published import published_cell
-from torchrl_l1.report.runs import Evaluation, Run
-from torchrl_l1.report.settings import BASELINE
-from torchrl_l1.report.statistics import mean_interval
-from torchrl_l1.report.training_tables import difference_summary
-from torchrl_l1.report.variants import Study, noise_order, variant_text
+from torchrl_l1.report.reading import Evaluation
+from torchrl_l1.report.runs import Run
+from torchrl_l1.report.statistics import difference_summary, mean_interval
+from torchrl_l1.report.study import Study, noise_order, variant_text
 
 PHASES = ("neither", "training only", "testing only", "both")
 """Where L1 is on, in the order in which tables and figures show it."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError, run_directories
 from torchrl_l1.report.algorithms import facts
+from torchrl_l1.report.identity import identify
 from torchrl_l1.report.reading import (
     SIGNALS,
     distinct_policies,
@@ -21,7 +22,6 @@ from torchrl_l1.report.reading import (
     read_versions,
 )
 from torchrl_l1.report.runs import Evaluation, Run
-from torchrl_l1.report.settings import identify
 
 T = TypeVar("T")
 

@@ -6,8 +6,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from torchrl_l1.report.curve_panels import Band, Grey, Line, Panel, plot_panels
+from torchrl_l1.report.identity import BASELINE
 from torchrl_l1.report.reference_curves import ReferenceCurves
-from torchrl_l1.report.settings import BASELINE
+from torchrl_l1.report.study import Cell, Study
 from torchrl_l1.report.style import (
     algorithm_color,
     algorithm_label,
@@ -17,7 +18,6 @@ from torchrl_l1.report.style import (
     named,
     title,
 )
-from torchrl_l1.report.variants import Cell, Study
 
 
 def plot_task(

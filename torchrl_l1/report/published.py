@@ -8,7 +8,7 @@ from functools import cache
 from importlib.resources import files
 
 from torchrl_l1.report.algorithms import facts
-from torchrl_l1.report.settings import BASELINE
+from torchrl_l1.report.identity import BASELINE
 
 # Controllers whose results the paper's "L1" stands for: its own and that of its released code.
 _PUBLISHED_ARMS = ("paper", "reference")

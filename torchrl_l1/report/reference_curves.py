@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from torchrl_l1.report.identity import BASELINE
 from torchrl_l1.report.numeric_csv import numeric_rows
-from torchrl_l1.report.settings import BASELINE
 
 COLUMNS = ("arm", "setting", "seed", "iteration", "total_train_samples", "average_return")
 

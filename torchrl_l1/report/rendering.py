@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torchrl_l1.report.evaluation_tables import PHASES
-from torchrl_l1.report.settings import BASELINE
-from torchrl_l1.report.tables import Footnotes, interval_text, markdown, number
+from torchrl_l1.report.identity import BASELINE
+from torchrl_l1.report.page import Footnotes, interval_text, markdown, number
 
 Row = Mapping[str, Any]
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from torchrl_l1.report.algorithms import MEASURING, facts
+from torchrl_l1.report.identity import Identity
 from torchrl_l1.report.reading import Evaluation
-from torchrl_l1.report.settings import Identity
 from torchrl_l1.report.statistics import WINDOW
 
 

@@ -6,8 +6,8 @@ from torchrl_l1.report.learning_curves import plot_stages
 from torchrl_l1.report.page import Page
 from torchrl_l1.report.rendering import stage_table
 from torchrl_l1.report.stage_tables import stage_rows
+from torchrl_l1.report.study import Study
 from torchrl_l1.report.style import title
-from torchrl_l1.report.variants import Study
 
 
 def stage_sections(page: Page, study: Study) -> None:

@@ -8,15 +8,10 @@ from typing import Any
 import numpy as np
 
 from torchrl_l1.report.algorithms import StageFacts
+from torchrl_l1.report.identity import BASELINE
 from torchrl_l1.report.runs import Run
-from torchrl_l1.report.settings import BASELINE
-from torchrl_l1.report.training_tables import (
-    difference_summary,
-    mean_summary,
-    place_columns,
-    with_baselines,
-)
-from torchrl_l1.report.variants import Study
+from torchrl_l1.report.statistics import difference_summary, mean_summary
+from torchrl_l1.report.study import Study, place_columns, with_baselines
 
 _SIGNALS = {"switches_per_1000": ("l1/switch_rate", 1000), "u_a": ("l1/u_a", 1)}
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_l1.report.page import markdown, number
 from torchrl_l1.report.runs import Run
-from torchrl_l1.report.tables import markdown, number
-from torchrl_l1.report.variants import Study
+from torchrl_l1.report.study import Study
 
 _WORDS = {
     "fit": "fit",

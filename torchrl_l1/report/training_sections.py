@@ -7,10 +7,10 @@ from torchrl_l1.report.page import Page
 from torchrl_l1.report.reference_curves import ReferenceCurves
 from torchrl_l1.report.rendering import paired_table, training_table
 from torchrl_l1.report.stage_sections import stage_sections
+from torchrl_l1.report.study import Study
 from torchrl_l1.report.style import title
 from torchrl_l1.report.time_tables import time_rows, time_table
 from torchrl_l1.report.training_tables import paired_rows, training_row
-from torchrl_l1.report.variants import Study
 
 
 def training_sections(page: Page, study: Study, reference: ReferenceCurves | None) -> None:

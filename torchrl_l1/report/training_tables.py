@@ -8,18 +8,17 @@ from typing import Any
 import numpy as np
 
 from torchrl_l1.report.algorithms import facts
+from torchrl_l1.report.identity import BASELINE
 from torchrl_l1.report.published import published_cell
 from torchrl_l1.report.reference_curves import ReferenceCurves
 from torchrl_l1.report.runs import Run
-from torchrl_l1.report.settings import BASELINE
 from torchrl_l1.report.statistics import (
+    difference_summary,
     final_return,
-    interquartile_interval,
-    interquartile_mean,
-    mean_interval,
+    mean_summary,
     published_spread,
 )
-from torchrl_l1.report.variants import Cell, Study, variant_text
+from torchrl_l1.report.study import Cell, Study, place_columns, with_baselines
 
 
 def run_rows(study: Study) -> list[dict[str, Any]]:
@@ -117,40 +116,6 @@ def paired_rows(study: Study) -> list[dict[str, Any]]:
     return rows
 
 
-def with_baselines(study: Study, runs: Sequence[Run]) -> tuple[list[tuple[Run, Run]], list[str]]:
-    """Each finished run with its finished baseline, and the seeds of the others."""
-    pairs, single = [], []
-    for run in runs:
-        baseline = study.baseline_of(run)
-        if run.finished and baseline is not None and baseline.finished:
-            pairs.append((run, baseline))
-        else:
-            single.append(str(run.identity.seed))
-    return pairs, single
-
-
-def difference_summary(differences: Sequence[float]) -> dict[str, Any]:
-    """Mean and, of five or more, interquartile mean, with intervals; and the differences."""
-    if not differences:
-        return {}
-    result = mean_summary("difference", differences)
-    interval = interquartile_interval(differences)
-    if interval is not None:
-        result["iqm"] = float(interquartile_mean(differences))
-        result |= {"iqm_low": interval.low, "iqm_high": interval.high}
-    result["differences"] = " ".join(f"{value:.6g}" for value in differences)
-    return result
-
-
-def mean_summary(name: str, values: Sequence[float]) -> dict[str, Any]:
-    """Mean and, of three values or more, its interval."""
-    result = {f"{name}_mean": float(np.mean(values))}
-    interval = mean_interval(values)
-    if interval is not None:
-        result |= {f"{name}_low": interval.low, f"{name}_high": interval.high}
-    return result
-
-
 def _signals(runs: Sequence[Run]) -> dict[str, float]:
     """What L1 did at the end of the training; what is known of it."""
     values = {
@@ -167,13 +132,3 @@ def _deterministic(run: Run, study: Study) -> dict[str, float | None]:
     if not study.facts.samples:
         return {}
     return {"return_deterministic": run.final_deterministic if run.finished else None}
-
-
-def place_columns(cell: Cell) -> dict[str, Any]:
-    """Where a cell is, as the first columns of a table."""
-    return {
-        "task": cell.task,
-        "noise": cell.noise,
-        "l1": cell.arm,
-        "variant": variant_text(cell.variant),
-    }

@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import NullLocator
 
 from torchrl_l1.experiment.l1_options import controller_label
-from torchrl_l1.report.settings import BASELINE
+from torchrl_l1.report.identity import BASELINE
+from torchrl_l1.report.study import noise_order
 from torchrl_l1.report.style import arm_label, color, fit_scale, grid, legend_below, save
-from torchrl_l1.report.variants import noise_order
 
 Row = Mapping[str, Any]
 

@@ -6,12 +6,13 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from torchrl_l1.envs import TASKS
 from torchrl_l1.report.algorithms import ALGORITHMS, AlgorithmFacts, facts
 from torchrl_l1.report.duplicates import distinct
+from torchrl_l1.report.identity import BASELINE, NOISES, default_text
 from torchrl_l1.report.runs import Run
-from torchrl_l1.report.settings import BASELINE, NOISES, default_text
 
 Deviations = tuple[tuple[str, str], ...]
 
@@ -141,6 +142,28 @@ def studies(runs: Sequence[Run]) -> list[Study]:
     for run in runs:
         groups.setdefault(run.identity.algorithm, []).append(run)
     return [Study(groups[name]) for name in ALGORITHMS if name in groups]
+
+
+def with_baselines(study: Study, runs: Sequence[Run]) -> tuple[list[tuple[Run, Run]], list[str]]:
+    """Each finished run with its finished baseline, and the seeds of the others."""
+    pairs, single = [], []
+    for run in runs:
+        baseline = study.baseline_of(run)
+        if run.finished and baseline is not None and baseline.finished:
+            pairs.append((run, baseline))
+        else:
+            single.append(str(run.identity.seed))
+    return pairs, single
+
+
+def place_columns(cell: Cell) -> dict[str, Any]:
+    """Where a cell is, as the first columns of a table."""
+    return {
+        "task": cell.task,
+        "noise": cell.noise,
+        "l1": cell.arm,
+        "variant": variant_text(cell.variant),
+    }
 
 
 def _pairing_key(run: Run) -> tuple[object, ...]:
