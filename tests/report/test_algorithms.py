@@ -18,21 +18,20 @@ from scipy.stats import ttest_1samp
 from torchrl_l1.experiment.settings import SCHEMAS
 from torchrl_l1.experiment.stages import STAGES
 from torchrl_l1.report import Study, curve_panels, report
-from torchrl_l1.report.algorithm_tables import (
+from torchrl_l1.report.algorithms import ALGORITHMS, facts
+from torchrl_l1.report.comparison import (
     algorithm_pairs,
     algorithm_rows,
     compared_places,
     differing_settings,
 )
-from torchrl_l1.report.algorithms import ALGORITHMS, facts
 from torchrl_l1.report.evaluation_tables import evaluation_rows
-from torchrl_l1.report.finding import find_runs
 from torchrl_l1.report.learning_curves import plot_algorithms
 from torchrl_l1.report.reading import Evaluation, one_policy
+from torchrl_l1.report.runs import find_runs
 from torchrl_l1.report.study import noise_order, studies
 from torchrl_l1.report.style import noise_words, title
-from torchrl_l1.report.time_tables import time_rows, time_table
-from torchrl_l1.report.training_tables import paired_rows, run_rows, training_row
+from torchrl_l1.report.training import paired_rows, run_rows, time_rows, time_table, training_row
 
 WriteRun = Callable[..., Path]
 RNG = np.random.default_rng(0)

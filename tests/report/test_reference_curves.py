@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchrl_l1.report.published import published_cells
-from torchrl_l1.report.reference_curves import COLUMNS, ReferenceCurves
+from torchrl_l1.report.published import COLUMNS, ReferenceCurves, published_cells
 from torchrl_l1.report.statistics import final_return, published_spread
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference" / "l1_metrpo_curves.csv"

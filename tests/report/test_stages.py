@@ -18,12 +18,11 @@ from torchrl_l1.experiment.run_directory import RunDirectoryError
 from torchrl_l1.experiment.stages import STAGES as ALL_STAGES
 from torchrl_l1.report import curve_panels, evaluation_figures, report
 from torchrl_l1.report.evaluation_tables import evaluation_rows
-from torchrl_l1.report.finding import find_readable_runs, find_runs
 from torchrl_l1.report.learning_curves import plot_stages, plot_task
-from torchrl_l1.report.stage_tables import stage_rows
+from torchrl_l1.report.runs import find_readable_runs, find_runs
+from torchrl_l1.report.stages import stage_rows
 from torchrl_l1.report.study import Study, studies
-from torchrl_l1.report.time_tables import time_rows, time_table
-from torchrl_l1.report.training_tables import training_row
+from torchrl_l1.report.training import time_rows, time_table, training_row
 
 WriteRun = Callable[..., Path]
 

@@ -12,7 +12,6 @@ from scipy.stats import trim_mean
 
 from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.report.evaluation_tables import ablation_rows, evaluation_rows
-from torchrl_l1.report.finding import find_runs
 from torchrl_l1.report.page import markdown
 from torchrl_l1.report.rendering import (
     ablation_table,
@@ -20,9 +19,9 @@ from torchrl_l1.report.rendering import (
     paired_table,
     training_table,
 )
+from torchrl_l1.report.runs import find_runs
 from torchrl_l1.report.study import Study
-from torchrl_l1.report.time_tables import time_rows, time_table
-from torchrl_l1.report.training_tables import paired_rows, run_rows, training_row
+from torchrl_l1.report.training import paired_rows, run_rows, time_rows, time_table, training_row
 
 WriteRun = Callable[..., Path]
 RNG = np.random.default_rng(0)

@@ -8,9 +8,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchrl_l1.report.finding import find_runs
 from torchrl_l1.report.identity import Identity
-from torchrl_l1.report.runs import Run
+from torchrl_l1.report.runs import Run, find_runs
 from torchrl_l1.report.study import Cell, Study, variant_text
 
 WriteRun = Callable[..., Path]

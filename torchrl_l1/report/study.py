@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from torchrl_l1.envs import TASKS
 from torchrl_l1.report.algorithms import ALGORITHMS, AlgorithmFacts, facts
-from torchrl_l1.report.duplicates import distinct
 from torchrl_l1.report.identity import BASELINE, NOISES, default_text
+from torchrl_l1.report.reading import Evaluation
 from torchrl_l1.report.runs import Run
 
 Deviations = tuple[tuple[str, str], ...]
@@ -62,7 +64,7 @@ class Study:
                 f"a study is of one algorithm, got {', '.join(sorted(algorithms)) or 'no runs'}"
             )
         (self.algorithm,) = algorithms
-        self.runs, self.duplicates = distinct(
+        self.runs, self.duplicates = _distinct(
             runs, lambda run: (*_pairing_key(run), run.identity.arm, _frozen(run.identity.l1))
         )
         self._main: dict[tuple[str, str], dict[str, str]] = {}
@@ -164,6 +166,43 @@ def place_columns(cell: Cell) -> dict[str, Any]:
         "l1": cell.arm,
         "variant": variant_text(cell.variant),
     }
+
+
+def _distinct(runs: Sequence[Run], same: Callable[[Run], Hashable]) -> tuple[list[Run], list[Run]]:
+    """One run of each kind, the one that is furthest, and the others.
+
+    An evaluation that the one lacks comes from another that is as far. Of an evaluation that
+    both have, the conditions that are missing come from it too where the returns of the
+    trainings are equal: then they are evaluations of the same policy.
+
+    Args:
+        runs: the runs, in order of preference.
+        same: equal for runs of one kind.
+    """
+    groups: dict[Hashable, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(same(run), []).append(run)
+    chosen, others = [], []
+    for group in groups.values():
+        best = max(group, key=lambda run: len(run.returns))
+        rest = [run for run in group if run is not best]
+        chosen.append(replace(best, evaluations=_merged_evaluations(best, rest)))
+        others += rest
+    return chosen, others
+
+
+def _merged_evaluations(best: Run, others: Sequence[Run]) -> dict[str, list[Evaluation]]:
+    merged = {name: list(tests) for name, tests in best.evaluations.items()}
+    for other in others:
+        if len(other.returns) != len(best.returns):
+            continue
+        for name, tests in other.evaluations.items():
+            if name not in merged:
+                merged[name] = list(tests)
+            elif np.array_equal(other.returns, best.returns):
+                known = {test.condition for test in merged[name]}
+                merged[name] += [test for test in tests if test.condition not in known]
+    return merged
 
 
 def _pairing_key(run: Run) -> tuple[object, ...]:

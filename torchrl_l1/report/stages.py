@@ -1,19 +1,55 @@
-"""The stages of an algorithm that has several: what each has reached, as rows of values."""
+"""The stages of an algorithm that has several: what each has reached."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torchrl_l1.report.algorithms import StageFacts
+from torchrl_l1.report.curves import Panel, main_lines, plot_panels, stage_bands
 from torchrl_l1.report.identity import BASELINE
+from torchrl_l1.report.page import (
+    Page,
+    Row,
+    difference_text,
+    grouped,
+    markdown,
+    number,
+    return_text,
+)
 from torchrl_l1.report.runs import Run
 from torchrl_l1.report.statistics import difference_summary, mean_summary
 from torchrl_l1.report.study import Study, place_columns, with_baselines
+from torchrl_l1.report.style import named, title
 
 _SIGNALS = {"switches_per_1000": ("l1/switch_rate", 1000), "u_a": ("l1/u_a", 1)}
+
+
+def stage_sections(page: Page, study: Study) -> None:
+    """What each stage has reached, with L1 and without; nothing where there is one stage only."""
+    stages = study.facts.stages
+    rows = stage_rows(study)
+    if not rows:
+        return
+    windows = ", ".join(f"{stage.window} of {stage.words}" for stage in stages)
+    page.heading(
+        "Stages",
+        "Return at the end of each stage: of what acts in it, the mean over its last outer "
+        f"iterations ({windows}; fewer where there are fewer); mean ± standard deviation over "
+        "seeds, 95 % interval of the mean. Differences are between runs of the same seed and "
+        "settings. L1 acts around the planner of "
+        f"{stages[0].words} and nowhere else: the difference in that stage is what it does there, "
+        "to the actions and through the data that the model is fitted to; the differences in "
+        "the stages after it are what it has done to what they learn.",
+    )
+    page.text(stage_table(rows))
+    page.csv("stages", rows)
+    for task in study.tasks():
+        figure = plot_stages(study, task, page.file("stages", task), page.name)
+        page.figure(figure, f"The stages, {title(task)}")
 
 
 def stage_rows(study: Study) -> list[dict[str, Any]]:
@@ -82,3 +118,40 @@ def _signals(runs: Sequence[Run], position: int, stage: StageFacts) -> dict[str,
         if np.isfinite(mean):
             found[name] = mean
     return found
+
+
+def stage_table(rows: Sequence[Row]) -> str:
+    """The return at the end of each stage, a column per L1 setting."""
+    arms = list(dict.fromkeys(row["l1"] for row in rows))
+    lines = []
+    keys = ("task", "noise", "variant", "stage", "policy")
+    for cell, found in grouped(rows, keys, "l1"):
+        on = [arm for arm in arms if arm != BASELINE]
+        line = dict(zip(keys, cell, strict=True))
+        line |= {
+            "real steps": ", ".join(dict.fromkeys(str(row["real_steps"]) for row in found.values()))
+        }
+        line |= {f"L1 {arm}": return_text(found.get(arm)) for arm in arms}
+        line |= {f"L1 {arm} less off": difference_text(found.get(arm, {})) for arm in on}
+        line["seeds"] = ", ".join(dict.fromkeys(str(row["seeds"]) for row in found.values()))
+        line["switches per 1000 steps"] = ", ".join(
+            number(found[arm]["switches_per_1000"])
+            for arm in on
+            if "switches_per_1000" in found.get(arm, {})
+        )
+        lines.append(line)
+    return markdown(lines)
+
+
+def plot_stages(study: Study, task: str, file: Path, name: str = "") -> Path | None:
+    """The same cells with a panel for each noise and stage: the first stages are short.
+
+    Returns:
+        the file, or ``None`` if no run has finished an iteration.
+    """
+    panels = []
+    for noise, lines in main_lines(study, task):
+        for position, band in enumerate(stage_bands(study, lines)):
+            heading = f"{named(name, title(task, noise))}: {band.label}"
+            panels.append(Panel(heading, lines, stage=position))
+    return plot_panels(panels, file, same_scale=True)
