@@ -7,6 +7,8 @@ import pkgutil
 from pathlib import Path
 from typing import Any
 
+from torchrl_l1.report.page import markdown
+
 PACKAGES = (
     "control",
     "dynamics",
@@ -23,8 +25,8 @@ PACKAGES = (
 def metrics_table(module: str) -> str:
     """Every metric that an algorithm logs, as a Markdown table."""
     metrics = importlib.import_module(f"torchrl_l1.algorithms.{module}").METRICS
-    rows = [f"| `{name}` | {meaning} |" for name, meaning in metrics.items()]
-    return "\n".join(["| Metric | Meaning |", "|---|---|", *rows, ""])
+    rows = [{"Metric": f"`{name}`", "Meaning": meaning} for name, meaning in metrics.items()]
+    return f"{markdown(rows)}\n"
 
 
 def api_page(package: str) -> str:

@@ -13,6 +13,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from torchrl_l1.report.page import markdown
+
 HERE = Path(__file__).parent
 
 
@@ -44,10 +46,9 @@ def robustness(source: Path) -> None:
     header = ["policy", "bias", *names]
     with (HERE / "robustness.csv").open("w", newline="") as handle:
         csv.writer(handle, lineterminator="\n").writerows([header, *rows])
-    lines = [f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
-    lines += [f"| {' | '.join(map(str, row))} |" for row in rows]
+    table = markdown([dict(zip(header, row, strict=True)) for row in rows])
     figures = "![robustness](results/robustness.png)\n" + filmstrip_figure(summary)
-    text = "\n".join([*lines, "", note, "", figures])
+    text = "\n".join([table, "", note, "", figures])
     (HERE / "robustness.md").write_text(text)
     print(text)
 

@@ -18,7 +18,7 @@ from torchrl_l1.report.numeric_csv import numeric_rows
 _PUBLISHED_ARMS = ("paper", "reference")
 
 
-COLUMNS = ("arm", "setting", "seed", "iteration", "total_train_samples", "average_return")
+CURVE_COLUMNS = ("arm", "setting", "seed", "iteration", "total_train_samples", "average_return")
 
 _TASKS = {
     "Inverted_Pendulum": "inverted_pendulum",
@@ -148,7 +148,7 @@ class ReferenceCurves:
         if not path.is_file():
             raise FileNotFoundError(f"no reference curves at {path}")
         runs: dict[tuple[str, str], dict[str, list[tuple[float, float]]]] = {}
-        for row in numeric_rows(path, COLUMNS[-2:], COLUMNS[:-2]):
+        for row in numeric_rows(path, CURVE_COLUMNS[-2:], CURVE_COLUMNS[:-2]):
             seeds = runs.setdefault((row["arm"], row["setting"]), {})
             steps = row["total_train_samples"] * _STEPS_PER_TRAINING_SAMPLE
             seeds.setdefault(row["seed"], []).append((steps, row["average_return"]))
