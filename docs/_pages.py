@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from torchrl_l1 import algorithms
+from torchrl_l1.report.page import markdown
 
 PACKAGES = (
     "control",
@@ -44,8 +45,8 @@ METRICS = {"metrics": "METRPO", "metrics_mbmf": "MBMF", "metrics_pets": "PETS"}
 def metrics_table(algorithm: str) -> str:
     """Every metric that an algorithm logs, as a Markdown table."""
     metrics = getattr(algorithms, algorithm).facts.metrics
-    rows = [f"| `{name}` | {meaning} |" for name, meaning in metrics.items()]
-    return "\n".join(["| Metric | Meaning |", "|---|---|", *rows, ""])
+    rows = [{"Metric": f"`{name}`", "Meaning": meaning} for name, meaning in metrics.items()]
+    return f"{markdown(rows)}\n"
 
 
 def api_page(package: str) -> str:

@@ -17,6 +17,7 @@ import pytest
 import yaml
 
 from torchrl_l1 import planning
+from torchrl_l1.algorithms import MBMF
 from torchrl_l1.campaign import EvaluationSettings, read_campaign
 from torchrl_l1.campaign.jobs import LAUNCHERS
 from torchrl_l1.campaign.plan import plan
@@ -26,7 +27,6 @@ from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import available_campaigns, available_recipes, recipes_dir
 from torchrl_l1.experiment.run import MODES
 from torchrl_l1.experiment.settings import SCHEMAS, L1Settings
-from torchrl_l1.experiment.stages import STAGES
 
 ROOT = Path(__file__).parents[1]
 SNIPPETS = [
@@ -205,7 +205,7 @@ def test_the_file_of_the_campaigns_page_is_one(tmp_path: Path) -> None:
     given = {"name": "offset", "where": shown.where, "bias": shown.bias}
     assert shown == EvaluationSettings(**given)
     stages = re.search(r"stage: \[\] +# .*\[(.*)\]", text)
-    assert stages is not None and tuple(stages[1].split(", ")) == STAGES["mbmf"]
+    assert stages is not None and tuple(stages[1].split(", ")) == MBMF.facts.stage_names
 
 
 def test_campaigns_page_names_every_launcher() -> None:
@@ -217,7 +217,7 @@ def test_campaigns_page_names_every_launcher() -> None:
 def test_mbmf_page_names_every_recipe_and_stage() -> None:
     page = (ROOT / "docs/mbmf.md").read_text()
     (stages,) = re.findall(r"--stage ([a-z_ ]+) --l1", page)
-    assert tuple(stages.split()) == STAGES["mbmf"]
+    assert tuple(stages.split()) == MBMF.facts.stage_names
     (listed,) = re.findall(r"one for each of the five tasks: (.*?)\.", page)
     assert {f"mbmf/{name}" for name in words(listed)} == {
         name for name in available_recipes() if name.startswith("mbmf/")

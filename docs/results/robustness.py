@@ -15,7 +15,7 @@ from pathlib import Path
 
 from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.report.evaluation_summary import summary_lines
-from torchrl_l1.report.tables import markdown
+from torchrl_l1.report.page import markdown
 
 HERE = Path(__file__).parent
 

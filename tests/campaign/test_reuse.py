@@ -20,7 +20,7 @@ from torchrl_l1.cli import main
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.run_directory import RunDirectory, locked
 from torchrl_l1.report import find_runs
-from torchrl_l1.report.variants import Study
+from torchrl_l1.report.study import Study
 
 EVALUATION = {"name": "noisy", "l1": ["off"], "noise": ["action"], "episodes": 1}
 

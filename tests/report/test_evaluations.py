@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from torchrl_l1.report.evaluation_data import Evaluation, one_policy
 from torchrl_l1.report.evaluation_summary import summarize, summary_tables
 from torchrl_l1.report.evaluations import (
     ablation_rows,
@@ -16,9 +18,9 @@ from torchrl_l1.report.evaluations import (
     evaluation_rows,
     evaluation_table,
 )
-from torchrl_l1.report.finding import find_runs
-from torchrl_l1.report.training_tables import training_row
-from torchrl_l1.report.variants import Study
+from torchrl_l1.report.runs import find_runs
+from torchrl_l1.report.study import Study, studies
+from torchrl_l1.report.training import training_row
 
 WriteRun = Callable[..., Path]
 
@@ -226,4 +228,38 @@ def test_summary_reads_as_a_table_in_a_terminal_and_a_page() -> None:
         "| ---- | ----------------- | -------------------- |",
         "|    0 | -1.5 [-1.5, -1.5] | -0.25 [-0.25, -0.25] |",
         "|  0.5 |    -15 [-15, -15] |    -2.5 [-2.5, -2.5] |",
+    ]
+
+
+def test_tests_of_one_way_to_act_count_once_however_named(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    def disturbed(*policies: str) -> list[dict[str, Any]]:
+        conditions = [(l1, "none", policy, 0.0) for policy in policies for l1 in ("off", "paper")]
+        rows = evaluated(0.0, *conditions)
+        return [row | {"bias": b, "return_mean": -1 - 9 * b} for row in rows for b in (0.0, 1.0)]
+
+    both = disturbed("deterministic", "stochastic")
+    for row in both:
+        row["return_mean"] -= 100 * (row["policy"] == "deterministic")
+    alone = disturbed("deterministic")
+    write_run(
+        [1], "l1=off", recipe="pets/inverted_pendulum", evaluations={"both": both, "alone": alone}
+    )
+    (study,) = studies(find_runs([tmp_path]))
+    for name in ("both", "alone"):
+        rows = evaluation_rows(study, name)
+        assert {row["policy"] for row in rows} == {"stochastic"}
+        assert [row["training_seeds"] for row in rows] == [1] * 4
+        assert [row["return_mean"] for row in rows] == [-1, -1, -10, -10]
+
+
+def test_other_algorithms_keep_both_policies_and_repetitions_merge() -> None:
+    first = Evaluation(l1="off", policy="deterministic", return_mean=-1.0, episodes=10)
+    second = replace(first, policy="stochastic", return_mean=-2.0)
+    other = replace(first, disturbances={"bias": 1.0}, return_mean=-3.0)
+    found = one_policy([first, second, other])
+    assert [(test.policy, test.return_mean) for test in found] == [
+        ("stochastic", -2.0),
+        ("stochastic", -3.0),
     ]

@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
             evaluate_command(options)
         elif options.command == "report":
-            from torchrl_l1.report.command import report_command
+            from torchrl_l1.report.build import report_command
 
             report_command(options)
         elif options.command == "verify":

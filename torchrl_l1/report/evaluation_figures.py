@@ -14,7 +14,8 @@ from matplotlib.ticker import NullLocator
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.l1_options import controller_label
 from torchrl_l1.report.algorithms import AlgorithmFacts
-from torchrl_l1.report.settings import BASELINE
+from torchrl_l1.report.identity import BASELINE
+from torchrl_l1.report.study import noise_order
 from torchrl_l1.report.style import (
     arm_label,
     color,
@@ -25,7 +26,6 @@ from torchrl_l1.report.style import (
     save,
     title,
 )
-from torchrl_l1.report.variants import noise_order
 
 Row = Mapping[str, Any]
 

@@ -8,8 +8,8 @@ from typing import Any
 
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.l1_options import controller_label
+from torchrl_l1.report.page import grouped, markdown
 from torchrl_l1.report.style import arm_label
-from torchrl_l1.report.tables import grouped, markdown
 
 Row = Mapping[str, Any]
 

@@ -18,24 +18,22 @@ from torchrl_l1.report.evaluation_figures import (
     plot_tuning,
     tuning_rows,
 )
-from torchrl_l1.report.page import Page
-from torchrl_l1.report.published import published_cell
-from torchrl_l1.report.runs import Run
-from torchrl_l1.report.settings import BASELINE
-from torchrl_l1.report.statistics import mean_interval
-from torchrl_l1.report.style import arm_label, named, noise_words, title
-from torchrl_l1.report.tables import (
+from torchrl_l1.report.identity import BASELINE
+from torchrl_l1.report.page import (
     Footnotes,
+    Page,
+    difference_text,
     grouped,
-    less_off,
     markdown,
     number,
     paper_text,
-    with_interval,
-    with_notes,
+    return_text,
 )
-from torchrl_l1.report.training_tables import difference_summary
-from torchrl_l1.report.variants import Study, noise_order, variant_text
+from torchrl_l1.report.published import published_cell
+from torchrl_l1.report.runs import Run
+from torchrl_l1.report.statistics import difference_summary, mean_interval
+from torchrl_l1.report.study import Study, noise_order, variant_text
+from torchrl_l1.report.style import arm_label, named, noise_words, title
 
 Row = Mapping[str, Any]
 Key = tuple[Any, ...]
@@ -346,13 +344,15 @@ def evaluation_table(rows: Sequence[Row]) -> str:
     for _, found in grouped(rows, keys, "l1"):
         first = next(iter(found.values()))
         line = _place(first) | {"training seeds": str(first["training_seeds"])}
-        line |= {f"L1 {l1}": with_interval(found.get(l1)) for l1 in tested}
+        line |= {f"L1 {l1}": return_text(found.get(l1)) for l1 in tested}
         line |= {
-            f"L1 {l1} less off": less_off(found.get(l1, {})) for l1 in tested if l1 != BASELINE
+            f"L1 {l1} less off": difference_text(found.get(l1, {}))
+            for l1 in tested
+            if l1 != BASELINE
         }
         line |= {f"paper, L1 {l1}": paper_text(found.get(l1, {}), notes) for l1 in tested}
         lines.append(line)
-    return with_notes(markdown(lines), notes)
+    return notes.below(markdown(lines))
 
 
 def tuning_table(rows: Sequence[Row]) -> str:
@@ -368,8 +368,8 @@ def tuning_table(rows: Sequence[Row]) -> str:
             "epsilon": number(row.get("epsilon")),
             "alpha": number(row.get("alpha")),
             "training seeds": str(row["training_seeds"]),
-            "return": with_interval(row),
-            "less off": less_off(row),
+            "return": return_text(row),
+            "less off": difference_text(row),
             "switches per 1000 steps": number(row.get("switches_per_1000_steps")),
         }
         for row in rows
@@ -403,10 +403,10 @@ def ablation_table(rows: Sequence[Row]) -> str:
     keys = ("task", "noise", "variant", "stage")
     for cell, found in grouped(rows, keys, "phase"):
         line = dict(zip(keys, cell, strict=True))
-        line |= {phase: with_interval(found.get(phase)) for phase in PHASES}
+        line |= {phase: return_text(found.get(phase)) for phase in PHASES}
         line["training seeds"] = ", ".join(
             sorted({str(row["training_seeds"]) for row in found.values()})
         )
         line |= {f"paper, {phase}": paper_text(found.get(phase, {}), notes) for phase in PHASES}
         lines.append(line)
-    return with_notes(markdown(lines), notes)
+    return notes.below(markdown(lines))

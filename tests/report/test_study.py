@@ -1,17 +1,19 @@
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchrl_l1.report.finding import find_runs
-from torchrl_l1.report.runs import Run
-from torchrl_l1.report.settings import Identity
-from torchrl_l1.report.variants import Cell, Study, variant_text
+from torchrl_l1.report.identity import Identity
+from torchrl_l1.report.runs import Run, find_runs
+from torchrl_l1.report.study import Cell, Study, noise_order, studies, variant_text
+from torchrl_l1.report.style import noise_words, title
 
 WriteRun = Callable[..., Path]
 
@@ -199,3 +201,38 @@ def test_variants_come_in_the_order_of_their_numbers(write_run: WriteRun, tmp_pa
     study = Study(find_runs([tmp_path]))
     found = [study.describe(cell, ("l1.epsilon",)) for cell in study.compared(("l1.epsilon",))]
     assert found == [f"l1.epsilon={value}" for value in ("1.0", "0.1", "3.0", "10.0")]
+
+
+def test_algorithms_are_never_pooled(write_run: WriteRun, tmp_path: Path) -> None:
+    for recipe in ("dets/inverted_pendulum", "metrpo/inverted_pendulum", "pets/inverted_pendulum"):
+        write_run([1], "l1=off", recipe=recipe)
+    runs = find_runs([tmp_path])
+    found = studies(runs)
+    assert [study.algorithm for study in found] == ["metrpo", "pets", "dets"]
+    for study in found:
+        ((cell, mine),) = study.cells.items()
+        assert cell.variant == () and len(mine) == 1 and not study.duplicates
+    with pytest.raises(ValueError, match="one algorithm, got dets, metrpo, pets"):
+        Study(runs)
+    with pytest.raises(ValueError, match="got no runs"):
+        Study([])
+
+
+def test_noise_of_other_strengths_comes_last_by_kind_and_strength() -> None:
+    order = [
+        "none",
+        "action",
+        "observation",
+        "both",
+        "action 0.05",
+        "action 0.3",
+        "action 2",
+        "action 10",
+        "observation 0.2",
+        "action 0.3, observation 0.1",
+        "action 0.3, observation 1",
+    ]
+    shuffled = random.Random(0).sample(order, len(order))
+    assert sorted(shuffled, key=noise_order) == order
+    assert noise_words("action 0.3, observation 1") == "action noise 0.3 and observation noise 1"
+    assert title("half_cheetah", "observation 0.2") == "Half cheetah, observation noise 0.2"

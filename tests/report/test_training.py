@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,16 +8,17 @@ import pytest
 import scipy.stats
 from scipy.stats import trim_mean
 
-from torchrl_l1.experiment.run_directory import write_table
-from torchrl_l1.report.finding import find_runs
-from torchrl_l1.report.rendering import (
+from torchrl_l1.report.runs import find_runs
+from torchrl_l1.report.study import Study, studies
+from torchrl_l1.report.training import (
+    paired_rows,
     paired_table,
+    run_rows,
+    time_rows,
+    time_table,
+    training_row,
     training_table,
 )
-from torchrl_l1.report.tables import markdown
-from torchrl_l1.report.time_tables import time_rows, time_table
-from torchrl_l1.report.training_tables import paired_rows, run_rows, training_row
-from torchrl_l1.report.variants import Study
 
 WriteRun = Callable[..., Path]
 RNG = np.random.default_rng(0)
@@ -133,21 +133,15 @@ def test_an_arm_without_baseline_has_no_differences(write_run: WriteRun, tmp_pat
     assert "3" in paired_table([row])
 
 
-def test_markdown_drops_columns_that_say_nothing() -> None:
-    rows = [{"a": "1", "b": "", "c": "–"}, {"a": "2", "b": "", "c": "3"}]
-    assert markdown(rows) == "| a | c |\n|---|---|\n| 1 | – |\n| 2 | 3 |"
-
-
-def test_markdown_without_rows_is_empty() -> None:
-    assert markdown([]) == ""
-
-
-def test_csv_keeps_full_precision_and_all_columns(tmp_path: Path) -> None:
-    write_table(tmp_path / "table.csv", [{"a": 1 / 3}, {"a": 2.0, "b": "x, y"}])
-    with (tmp_path / "table.csv").open() as file:
-        first, second = csv.DictReader(file)
-    assert float(first["a"]) == 1 / 3
-    assert (first["b"], second["b"]) == ("", "x, y")
+def test_one_way_to_act_is_printed_once(write_run: WriteRun, tmp_path: Path) -> None:
+    for seed in range(2):
+        for arm in ("off", "paper"):
+            write_run([1, 2, 3 + seed], f"l1={arm}", recipe="pets/inverted_pendulum", seed=seed)
+    (study,) = studies(find_runs([tmp_path]))
+    assert "deterministic_mean" not in training_row(*next(iter(study.cells.items())))
+    assert "return_deterministic" not in run_rows(study)[0]
+    (pair,) = paired_rows(study)
+    assert "policy" not in pair and pair["pairs"] == 2
 
 
 def test_time_rows_are_medians_of_finished_runs(write_run: WriteRun, tmp_path: Path) -> None:
@@ -165,3 +159,21 @@ def test_time_rows_are_medians_of_finished_runs(write_run: WriteRun, tmp_path: P
     # (1 + 9) / 2 or (3 + 5) / 2, and 2.75 for the other phases, in 1500 steps an iteration.
     assert row["ms_per_step"] == pytest.approx(1000 * np.mean([15.5, 13.5]) / 3000)
     assert "| inverted_pendulum | none | off | 2 | 4 | 2 | 0.25 | 100 | 4.83 |" in time_table([row])
+
+
+def test_times_are_those_of_the_phases_that_there_are(write_run: WriteRun, tmp_path: Path) -> None:
+    timings = [
+        {"iteration": i, "random": 0.5 * (i == 0), "fit": 1.0, "collect": 4.0, "evaluate": 100.0}
+        for i in range(2)
+    ]
+    write_run([1, 2], "l1=off", recipe="pets/inverted_pendulum", timings=timings, steps=100)
+    (study,) = studies(find_runs([tmp_path]))
+    (row,) = time_rows(study)
+    assert (row["fit"], row["collect"], row["evaluate"]) == (1.0, 4.0, 100.0)
+    assert "trpo" not in row
+    # Two times 5 seconds and the random data, for 300 steps.
+    assert row["ms_per_step"] == pytest.approx(1000 * 10.5 / 300)
+    assert time_table([row]).splitlines()[0] == (
+        "| task | noise | L1 | runs | fit, s | collection, s | measuring returns, s "
+        "| training, ms per real step |"
+    )

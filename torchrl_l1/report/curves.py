@@ -1,8 +1,8 @@
-"""Panels of returns against real steps: single seeds, means, and the authors' behind them."""
+"""Return against real steps: the learning curves of a task, and the panels of all such figures."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,14 +10,132 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from torchrl_l1.report.reference_curves import Curves
+from torchrl_l1.report.identity import BASELINE
+from torchrl_l1.report.page import Page
+from torchrl_l1.report.published import Curves, ReferenceCurves
 from torchrl_l1.report.runs import Run
-from torchrl_l1.report.style import fit_scale, grid, legend_below, save
+from torchrl_l1.report.study import Cell, Study
+from torchrl_l1.report.style import (
+    arm_label,
+    color,
+    fit_scale,
+    grid,
+    legend_below,
+    named,
+    save,
+    title,
+)
 
 # Trainings that differ more in length are drawn over a logarithmic axis.
 _MOST_TIMES = 5
 
 _SHADES = ("0.82", "0.91")
+
+
+def curve_section(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
+    """A figure per task.
+
+    Args:
+        page: where to.
+        study: the runs.
+        reference: curves to draw behind.
+    """
+    page.heading(
+        "Learning curves",
+        "Thin: single seeds; bold: their mean"
+        + _dashed(study)
+        + "; grey: mean of the authors' logs, where they were given, cut where ours end"
+        * study.facts.reference_logs
+        + _bands(study)
+        + ".",
+    )
+    for task in study.tasks():
+        file = page.file("learning_curves", task)
+        figure = plot_task(study, task, file, reference, page.name)
+        page.figure(figure, f"Learning curves, {title(task)}")
+
+
+def _dashed(study: Study) -> str:
+    places = study.facts.mean_action_stages
+    words = [stage.words for place, stage in enumerate(study.facts.named_stages) if place in places]
+    where = f" in {' and '.join(words)}" if words else ""
+    return f"; dashed: mean of the return with the mean action{where}" if places else ""
+
+
+def _bands(study: Study) -> str:
+    words = [stage.words for stage in study.facts.named_stages]
+    if not words:
+        return ""
+    return f"; shaded: the stages before {words[-1]}, {' and '.join(words[:-1])}"
+
+
+def plot_task(
+    study: Study,
+    task: str,
+    file: Path,
+    reference: ReferenceCurves | None = None,
+    name: str = "",
+) -> Path | None:
+    """The main cells of a task, a panel per noise.
+
+    Args:
+        study: the runs.
+        task: the task.
+        file: where to.
+        reference: curves to draw behind.
+        name: of the algorithm, where there are several.
+
+    Returns:
+        the file, or ``None`` if no run has finished an iteration.
+    """
+    panels = []
+    for noise, lines in main_lines(study, task):
+        heading = named(name, title(task, noise))
+        authors = _authors(reference, task, noise)
+        earlier = len(study.facts.named_stages[:-1])
+        panels.append(Panel(heading, lines, authors, stage_bands(study, lines)[:earlier]))
+    return plot_panels(panels, file)
+
+
+def _authors(reference: ReferenceCurves | None, task: str, noise: str) -> list[Grey]:
+    if reference is None:
+        return []
+    found = []
+    for arm, label, style in ((BASELINE, "METRPO", "-"), ("paper", "L1-METRPO", ":")):
+        curves = reference.training(task, noise, arm)
+        if curves is not None:
+            found.append(Grey(f"authors' logs, {label}", style, curves))
+    return found
+
+
+def main_lines(study: Study, task: str) -> Iterator[tuple[str, list[Line]]]:
+    """A line for each main cell of a task, by noise."""
+    cells = [cell for cell in study.cells if cell.task == task and not cell.variant]
+    for noise in dict.fromkeys(cell.noise for cell in cells):
+        chosen = [cell for cell in cells if cell.noise == noise]
+        yield (
+            noise,
+            [
+                cell_line(study, cell, arm_label(cell.arm), color(3 + i, cell.arm))
+                for i, cell in enumerate(chosen)
+            ],
+        )
+
+
+def cell_line(study: Study, cell: Cell, label: str, shade: str) -> Line:
+    """The curves of a cell."""
+    return Line(label, shade, study.cells[cell], mean_action=study.facts.mean_action_stages)
+
+
+def stage_bands(study: Study, lines: Sequence[Line]) -> list[Band]:
+    """Where the stages are, in the run that is furthest; none where there is one stage only."""
+    furthest = max((run for line in lines for run in line.runs), key=lambda run: len(run.returns))
+    bands: list[Band] = []
+    for position, stage in enumerate(study.facts.named_stages):
+        steps = furthest.real_steps[furthest.during(position)]
+        if len(steps):
+            bands.append(Band(stage.words, bands[-1].end if bands else 0.0, float(steps[-1])))
+    return bands
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
 
 from torchrl_l1.envs import TASKS
 from torchrl_l1.report.algorithms import ALGORITHMS, AlgorithmFacts, facts
-from torchrl_l1.report.duplicates import distinct
+from torchrl_l1.report.evaluation_data import Evaluation
+from torchrl_l1.report.identity import BASELINE, NOISES, default_text
 from torchrl_l1.report.runs import Run
-from torchrl_l1.report.settings import BASELINE, NOISES, default_text
 
 Deviations = tuple[tuple[str, str], ...]
 
@@ -61,7 +64,7 @@ class Study:
                 f"a study is of one algorithm, got {', '.join(sorted(algorithms)) or 'no runs'}"
             )
         (self.algorithm,) = algorithms
-        self.runs, self.duplicates = distinct(
+        self.runs, self.duplicates = _distinct(
             runs, lambda run: (*_pairing_key(run), run.identity.arm, _frozen(run.identity.l1))
         )
         self._main: dict[tuple[str, str], dict[str, str]] = {}
@@ -141,6 +144,65 @@ def studies(runs: Sequence[Run]) -> list[Study]:
     for run in runs:
         groups.setdefault(run.identity.algorithm, []).append(run)
     return [Study(groups[name]) for name in ALGORITHMS if name in groups]
+
+
+def with_baselines(study: Study, runs: Sequence[Run]) -> tuple[list[tuple[Run, Run]], list[str]]:
+    """Each finished run with its finished baseline, and the seeds of the others."""
+    pairs, single = [], []
+    for run in runs:
+        baseline = study.baseline_of(run)
+        if run.finished and baseline is not None and baseline.finished:
+            pairs.append((run, baseline))
+        else:
+            single.append(str(run.identity.seed))
+    return pairs, single
+
+
+def place_columns(cell: Cell) -> dict[str, Any]:
+    """Where a cell is, as the first columns of a table."""
+    return {
+        "task": cell.task,
+        "noise": cell.noise,
+        "l1": cell.arm,
+        "variant": variant_text(cell.variant),
+    }
+
+
+def _distinct(runs: Sequence[Run], same: Callable[[Run], Hashable]) -> tuple[list[Run], list[Run]]:
+    """One run of each kind, the one that is furthest, and the others.
+
+    An evaluation that the one lacks comes from another that is as far. Of an evaluation that
+    both have, the conditions that are missing come from it too where the returns of the
+    trainings are equal: then they are evaluations of the same policy.
+
+    Args:
+        runs: the runs, in order of preference.
+        same: equal for runs of one kind.
+    """
+    groups: dict[Hashable, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(same(run), []).append(run)
+    chosen, others = [], []
+    for group in groups.values():
+        best = max(group, key=lambda run: len(run.returns))
+        rest = [run for run in group if run is not best]
+        chosen.append(replace(best, evaluations=_merged_evaluations(best, rest)))
+        others += rest
+    return chosen, others
+
+
+def _merged_evaluations(best: Run, others: Sequence[Run]) -> dict[str, list[Evaluation]]:
+    merged = {name: list(tests) for name, tests in best.evaluations.items()}
+    for other in others:
+        if len(other.returns) != len(best.returns):
+            continue
+        for name, tests in other.evaluations.items():
+            if name not in merged:
+                merged[name] = list(tests)
+            elif np.array_equal(other.returns, best.returns):
+                known = {test.condition for test in merged[name]}
+                merged[name] += [test for test in tests if test.condition not in known]
+    return merged
 
 
 def _pairing_key(run: Run) -> tuple[object, ...]:
