@@ -11,13 +11,13 @@ import pytest
 from matplotlib.figure import Figure
 
 from torchrl_l1.report import evaluation_figures, report
-from torchrl_l1.report.algorithms import facts
 from torchrl_l1.report.evaluation_figures import (
     RANGES,
     plot_disturbances,
     plot_tuning,
     tuning_rows,
 )
+from torchrl_l1.report.identity import facts
 
 WriteRun = Callable[..., Path]
 METRPO = facts("metrpo")

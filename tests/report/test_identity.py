@@ -81,3 +81,16 @@ def test_a_run_older_than_the_setting_is_of_metrpo(write_run: WriteRun, tmp_path
     write_run([1], "l1=off", seed=1)
     (study,) = studies(find_runs([tmp_path]))
     assert study.algorithm == "metrpo" and len(study.cells) == 1
+
+
+def test_every_algorithm_is_known_with_its_ways_to_act() -> None:
+    assert set(SCHEMAS) <= set(ALGORITHMS)
+    expected = {"metrpo": True, "mbmf": True, "pets": False, "dets": False}
+    assert {name: facts(name).samples for name in ALGORITHMS} == expected
+    stages = {name: [stage.name for stage in facts(name).named_stages] for name in SCHEMAS}
+    # In the order of the stages as users type them.
+    assert stages == {
+        "metrpo": [], "pets": [], "mbmf": ["shooting", "cloning", "fine_tuning"],
+    }  # fmt: skip
+    with pytest.raises(ValueError, match="'nothing'; there are metrpo, mbmf, pets, dets"):
+        facts("nothing")

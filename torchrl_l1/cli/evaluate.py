@@ -30,9 +30,9 @@ from torchrl_l1.experiment.matrix import Condition, axes, check_values, conditio
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.experiment.settings import RunSettings, WandbSettings
-from torchrl_l1.report.algorithms import facts
 from torchrl_l1.report.evaluation_figures import RANGES, plot_disturbances
 from torchrl_l1.report.evaluation_summary import summarize, summary_tables
+from torchrl_l1.report.identity import facts
 
 _SECONDS_SHOWN = 4.0
 _COLUMNS = 10

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.matrix import Condition
-from torchrl_l1.report.algorithms import AlgorithmFacts
 from torchrl_l1.report.reading import SWITCH_RATE, checked_rows
 
 # Every table has the columns of these; that of another disturbance may be absent.

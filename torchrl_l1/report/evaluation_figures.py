@@ -11,9 +11,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import NullLocator
 
+from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.l1_options import controller_label
-from torchrl_l1.report.algorithms import AlgorithmFacts
 from torchrl_l1.report.identity import BASELINE
 from torchrl_l1.report.study import noise_order
 from torchrl_l1.report.style import (

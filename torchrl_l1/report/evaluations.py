@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.matrix import undisturbed
-from torchrl_l1.report.algorithms import AlgorithmFacts, facts
 from torchrl_l1.report.evaluation_data import Evaluation, condition_columns
 from torchrl_l1.report.evaluation_figures import (
     PHASES,
@@ -18,7 +18,7 @@ from torchrl_l1.report.evaluation_figures import (
     plot_tuning,
     tuning_rows,
 )
-from torchrl_l1.report.identity import BASELINE
+from torchrl_l1.report.identity import BASELINE, facts
 from torchrl_l1.report.page import (
     Footnotes,
     Page,

@@ -9,11 +9,21 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from torchrl_l1.algorithms import MBMF, METRPO, PETS
+from torchrl_l1.algorithms.facts import AlgorithmFacts
+from torchrl_l1.algorithms.pets import DETS
 from torchrl_l1.control.config import DEFAULT_ALPHA
 from torchrl_l1.experiment.l1_options import closest_option, departures, filter_gain
 from torchrl_l1.experiment.recipes import shared_dir
 from torchrl_l1.experiment.settings import VOLATILE_KEYS, L1Settings, flatten, schema_defaults
-from torchrl_l1.report.algorithms import facts
+
+ALGORITHMS: Mapping[str, AlgorithmFacts] = {
+    "metrpo": METRPO.facts,
+    "mbmf": MBMF.facts,
+    "pets": PETS.facts,
+    "dets": DETS,
+}
+"""By name, see :class:`Identity`, in the order in which a report shows them."""
 
 BASELINE = "off"
 """Name of the arm without L1."""
@@ -147,3 +157,18 @@ def _text(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     return str(value)
+
+
+def facts(algorithm: str) -> AlgorithmFacts:
+    """What is known of an algorithm.
+
+    Raises:
+        ValueError: if nothing is.
+
+    Examples:
+        >>> facts("dets").samples
+        False
+    """
+    if algorithm not in ALGORITHMS:
+        raise ValueError(f"no report of algorithm {algorithm!r}; there are {', '.join(ALGORITHMS)}")
+    return ALGORITHMS[algorithm]

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_l1.report.algorithms import facts
-from torchrl_l1.report.identity import BASELINE
-from torchrl_l1.report.numeric_csv import numeric_rows
+from torchrl_l1.report.identity import BASELINE, facts
+from torchrl_l1.report.reading import numeric_rows
 
 # Controllers whose results the paper's "L1" stands for: its own and that of its released code.
 _PUBLISHED_ARMS = ("paper", "reference")
@@ -92,7 +91,7 @@ def published_cell(
         trained: L1 setting of the training.
         testing_noise: noise of the test; that of the training in a run's own returns.
         tested: L1 setting of the test.
-        algorithm: see :data:`~torchrl_l1.report.algorithms.ALGORITHMS`. Of MBMF there are only the
+        algorithm: see :data:`~torchrl_l1.report.identity.ALGORITHMS`. Of MBMF there are only the
             returns of the training.
 
     Examples:

@@ -13,9 +13,8 @@ import numpy as np
 
 from torchrl_l1.algorithms.facts import MEASURING, WINDOW
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError, run_directories
-from torchrl_l1.report.algorithms import facts
 from torchrl_l1.report.evaluation_data import Evaluation, distinct_policies, read_evaluations
-from torchrl_l1.report.identity import Identity, identify
+from torchrl_l1.report.identity import Identity, facts, identify
 from torchrl_l1.report.reading import SIGNALS, read_metrics, read_seconds, read_versions
 
 T = TypeVar("T")

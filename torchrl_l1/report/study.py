@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.envs import TASKS
-from torchrl_l1.report.algorithms import ALGORITHMS, AlgorithmFacts, facts
 from torchrl_l1.report.evaluation_data import Evaluation
-from torchrl_l1.report.identity import BASELINE, NOISES, default_text
+from torchrl_l1.report.identity import ALGORITHMS, BASELINE, NOISES, default_text, facts
 from torchrl_l1.report.runs import Run
 
 Deviations = tuple[tuple[str, str], ...]

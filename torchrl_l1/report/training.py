@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_l1.report.algorithms import facts
 from torchrl_l1.report.curves import Grey, Panel, cell_line, curve_section, plot_panels
-from torchrl_l1.report.identity import BASELINE
+from torchrl_l1.report.identity import BASELINE, facts
 from torchrl_l1.report.page import (
     Footnotes,
     Page,
