@@ -3,6 +3,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
+from torchrl_l1.experiment.settings import SCHEMAS
+from torchrl_l1.report.identity import ALGORITHMS, facts
 from torchrl_l1.report.runs import find_runs
 from torchrl_l1.report.study import studies
 
