@@ -74,6 +74,9 @@ def test_locks_of_older_versions_count(tmp_path: Path) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         assert RunDirectory(tmp_path).held()
     assert not RunDirectory(tmp_path).held()
-    with locked(tmp_path / ".lock"), (tmp_path / ".lock").open() as lock:
-        with pytest.raises(BlockingIOError):
-            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    with (
+        locked(tmp_path / ".lock"),
+        (tmp_path / ".lock").open() as lock,
+        pytest.raises(BlockingIOError),
+    ):
+        fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
