@@ -9,6 +9,8 @@ import io
 import math
 import re
 import shlex
+import tomllib
+from dataclasses import fields
 from pathlib import Path
 from types import ModuleType
 from typing import get_args
@@ -22,6 +24,7 @@ from torchrl_l1.campaign import EvaluationSettings, read_campaign
 from torchrl_l1.campaign.jobs import LAUNCHERS
 from torchrl_l1.campaign.plan import plan
 from torchrl_l1.cli import main
+from torchrl_l1.control import L1Config
 from torchrl_l1.envs import TASKS, gymnasium_id
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import available_campaigns, available_recipes, recipes_dir
@@ -264,3 +267,47 @@ def test_planning_page_has_every_option_and_public_name() -> None:
     names = text[text.index("\n## Public names") :]
     assert set(planning.__all__) <= words(names) | {"PLAN_KEY"}
     assert "torchrl_l1.planning.PLAN_KEY" in names
+
+
+def test_the_two_controllers_differ_where_the_page_says() -> None:
+    presets = ("`L1Config.paper(dt)` (default)", "`L1Config.reference(dt)`")
+    rows = table("docs/l1.md", "", *presets)
+    paper, reference = L1Config.paper(0.05), L1Config.reference(0.05)
+    differ = {f.name for f in fields(paper) if getattr(paper, f.name) != getattr(reference, f.name)}
+    page = (ROOT / "docs/l1.md").read_text()
+    assert len(rows) == len(differ)
+    assert {name for name in differ if f"(`{name}`" in page} == differ
+
+
+def test_launchers_of_the_recipes_page_are_the_extras() -> None:
+    rows = table("docs/recipes.md", "Extra", "Where the runs go", "Override")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for name, (_, override) in rows.items():
+        (extra,) = re.findall(r"torchrl-l1\[(\w+)\]", name)
+        assert f"hydra-{extra}-launcher" in project["optional-dependencies"][extra][0]
+        assert override.strip("`").removeprefix("hydra/launcher=") in LAUNCHERS
+
+
+def test_metrics_that_pages_name_are_logged() -> None:
+    spec = importlib.util.spec_from_file_location("docs_pages", ROOT / "docs/_pages.py")
+    pages = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(pages)
+    tables = "".join(map(pages.metrics_table, pages.METRICS.values()))
+    known = set(re.findall(r"^\| `(.*?)` \|", tables, re.MULTILINE))
+    groups = "|".join({name.partition("/")[0] for name in known if "/" in name})
+    named = {
+        name
+        for page in PAGES
+        for name in re.findall(rf"`((?:{groups})/[a-z_0-9]+)`", page.read_text())
+    }
+    assert len(named) > 3 and named <= known
+
+
+def test_readme_counts_tasks_and_algorithms() -> None:
+    numbers = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
+    folders = {name.partition("/")[0] for name in available_recipes()}
+    tasks, algorithms = numbers[len(TASKS)].capitalize(), numbers[len(folders)]
+    assert (
+        f"{tasks} tasks ([which](docs/tasks.md)), {algorithms} algorithms"
+        in (ROOT / "README.md").read_text()
+    )
