@@ -171,8 +171,10 @@ class EvaluationSettings:
 
     @staticmethod
     def keys() -> list[str]:
-        """The keys in a campaign file."""
-        return ["name", "where", *(axis.name for axis in axes()), "episodes", "seed"]
+        """The keys in a campaign file, in the order in which they are written."""
+        varied = [axis.name for axis in axes()]
+        how_many = 1 + varied.index("policy")
+        return ["name", "where", *varied[:how_many], "episodes", "seed", *varied[how_many:]]
 
     @classmethod
     def from_keys(cls, **entry: Any) -> EvaluationSettings:
@@ -189,12 +191,15 @@ class EvaluationSettings:
         return cls(**rest, matrix={key: entry[key] for key in entry if key in varied})
 
     def to_keys(self) -> dict[str, Any]:
-        """The keys with their values, all of them."""
-        return {"name": self.name, "where": self.where, **self.of_a_run()}
+        """The :meth:`keys` with their values."""
+        values = {**vars(self), **self.matrix}
+        return {key: values[key] for key in self.keys()}
 
     def of_a_run(self) -> dict[str, Any]:
         """What the table of a single run depends on: all keys but ``name`` and ``where``."""
-        return {**self.matrix, "episodes": self.episodes, "seed": self.seed}
+        settings = self.to_keys()
+        del settings["name"], settings["where"]
+        return settings
 
 
 @dataclass
