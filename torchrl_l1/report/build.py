@@ -76,7 +76,8 @@ def report(
         part = page.part(study.facts.name) if len(every) > 1 else page
         training_sections(part, study, reference)
         evaluation_sections(part, study)
-    algorithm_sections(page, every)
+    if len(every) > 1:
+        algorithm_sections(page, every)
     _versions(page, runs)
     file = output / "report.md"
     write_atomically(file, page.render())

@@ -19,7 +19,7 @@ from torchrl_l1.report.page import (
 from torchrl_l1.report.runs import Run
 from torchrl_l1.report.statistics import difference_summary
 from torchrl_l1.report.study import Cell, Study, noise_order
-from torchrl_l1.report.style import algorithm_color, algorithm_label, arm_style, title
+from torchrl_l1.report.style import algorithm_label, arm_style, title
 from torchrl_l1.report.training import training_row
 
 # Of a row of the training, what can be compared.
@@ -241,7 +241,7 @@ def plot_algorithms(
         lines = [
             Line(
                 algorithm_label(study.facts.name, cell.arm),
-                algorithm_color(study.algorithm),
+                study.facts.color,
                 runs,
                 style=arm_style(cell.arm, arms),
             )

@@ -29,7 +29,7 @@ _SIGNALS = {"switches_per_1000": ("l1/switch_rate", 1000), "u_a": ("l1/u_a", 1)}
 
 
 def stage_sections(page: Page, study: Study) -> None:
-    """What each stage has reached, with L1 and without; nothing where there is one stage only."""
+    """What each stage has reached, with L1 and without; nothing where no run is finished."""
     stages = study.facts.named_stages
     rows = stage_rows(study)
     if not rows:

@@ -20,8 +20,6 @@ from torchrl_l1.report.identity import BASELINE
 
 # Okabe and Ito: told apart with any colour vision. Grey is kept for the authors' curves.
 _ARMS = {"off": "#D55E00", "paper": "#0072B2", "reference": "#009E73", "slow": "#CC79A7"}
-# Not those of the arms, which vary within an algorithm.
-_ALGORITHMS = {"metrpo": "#000000", "mbmf": "#E69F00", "pets": "#CC79A7", "dets": "#009E73"}
 _CYCLE = ("#D55E00", "#0072B2", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#000000")
 
 _NOISES = {
@@ -52,11 +50,6 @@ def arm_style(arm: str, arms: Sequence[str]) -> Any:
     styles = ("-", "-.", (0, (6, 1, 1, 1, 1, 1)), (0, (1, 1)))
     on = [other for other in arms if other != BASELINE]
     return "--" if arm == BASELINE else styles[on.index(arm) % len(styles)]
-
-
-def algorithm_color(algorithm: str) -> str:
-    """Colour of an algorithm."""
-    return _ALGORITHMS.get(algorithm, "#56B4E9")
 
 
 def algorithm_label(name: str, arm: str) -> str:

@@ -57,7 +57,8 @@ def training_sections(page: Page, study: Study, reference: ReferenceCurves | Non
     _training(page, study, reference)
     _pairs(page, study)
     curve_section(page, study, reference)
-    stage_sections(page, study)
+    if study.facts.named_stages:
+        stage_sections(page, study)
     _comparisons(page, study, reference)
     _time(page, study)
 
