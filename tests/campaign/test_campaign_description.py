@@ -22,7 +22,8 @@ from torchrl_l1.campaign.description import (
 from torchrl_l1.campaign.jobs import LAUNCHERS, check_launcher, sweep
 from torchrl_l1.campaign.plan import PlannedRun, check_devices, plan
 from torchrl_l1.cli import main
-from torchrl_l1.experiment.recipes import RecipeError, available_campaigns, available_recipes
+from torchrl_l1.experiment.errors import RecipeError
+from torchrl_l1.experiment.recipes import available_campaigns, available_recipes
 from torchrl_l1.experiment.settings import L1Settings, l1_config
 
 RUNS = "runs: [{recipe: metrpo/inverted_pendulum, matrix: {l1: [off, paper], seed: [0, 1]}}]\n"

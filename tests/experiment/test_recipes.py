@@ -8,8 +8,9 @@ from omegaconf import OmegaConf
 
 from torchrl_l1.control import L1Config
 from torchrl_l1.envs import get_task
+from torchrl_l1.experiment.errors import RecipeError
 from torchrl_l1.experiment.launch import compose
-from torchrl_l1.experiment.recipes import RecipeError, available_recipes, find_recipe
+from torchrl_l1.experiment.recipes import available_recipes, find_recipe
 from torchrl_l1.experiment.settings import (
     METRPORecipe,
     PETSRecipe,

@@ -19,8 +19,9 @@ from omegaconf import DictConfig, OmegaConf
 
 import torchrl_l1
 from torchrl_l1.algorithms import METRPO
+from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError, save_atomically
+from torchrl_l1.experiment.run_directory import RunDirectory, save_atomically
 
 METRICS = METRPO.facts.metrics
 

@@ -8,11 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_l1.experiment.run_directory import (
-    RunDirectory,
-    RunDirectoryInUse,
-    locked,
-)
+from torchrl_l1.experiment.errors import RunDirectoryInUse
+from torchrl_l1.experiment.run_directory import RunDirectory, locked
 
 HOLD = """
 import subprocess, sys, time

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_l1.experiment.run_directory import RunDirectoryError
+from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.report.runs import find_readable_runs, find_runs
 
 WriteRun = Callable[..., Path]

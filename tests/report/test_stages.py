@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from scipy.stats import t
 
 from torchrl_l1.algorithms import MBMF
-from torchrl_l1.experiment.run_directory import RunDirectoryError
+from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.report import curves, evaluation_figures, report
 from torchrl_l1.report.curves import plot_task
 from torchrl_l1.report.evaluations import evaluation_rows

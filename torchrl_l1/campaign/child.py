@@ -56,9 +56,8 @@ def train(settings: Mapping[str, Any]) -> None:
     from omegaconf import DictConfig, OmegaConf
 
     from torchrl_l1.campaign.workers import TEMPORARY_FAILURE
-    from torchrl_l1.experiment.errors import USER_ERRORS, message
+    from torchrl_l1.experiment.errors import USER_ERRORS, RunDirectoryInUse, message
     from torchrl_l1.experiment.run import run
-    from torchrl_l1.experiment.run_directory import RunDirectoryInUse
     from torchrl_l1.experiment.settings import schema_of
 
     config = OmegaConf.merge(OmegaConf.structured(schema_of(settings)), dict(settings))

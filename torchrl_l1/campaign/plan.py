@@ -21,11 +21,11 @@ from torchrl_l1.campaign.description import (
     value_text,
 )
 from torchrl_l1.envs import get_task
-from torchrl_l1.experiment.errors import USER_ERRORS, message
+from torchrl_l1.experiment.errors import USER_ERRORS, RunDirectoryError, message
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run import check_mode
-from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
+from torchrl_l1.experiment.run_directory import RunDirectory
 from torchrl_l1.experiment.settings import SCHEMAS, RunSettings, compile_mode, l1_config
 
 

@@ -6,7 +6,7 @@ Importing this package registers the tasks with Gymnasium, ``torchrl_l1/HalfChee
 from __future__ import annotations
 
 from torchrl_l1.envs.factory import make_env
-from torchrl_l1.envs.gymnasium_env import MujocoTaskEnv, gymnasium_id, register_tasks
+from torchrl_l1.envs.gymnasium_env import MujocoTaskEnv
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
 from torchrl_l1.envs.perturbations import (
     DISTURBANCES,
@@ -20,6 +20,7 @@ from torchrl_l1.envs.perturbations import (
 from torchrl_l1.envs.simulation import BatchedSimulator, StartStates, TaskSimulation
 from torchrl_l1.envs.task import Task
 from torchrl_l1.envs.tasks import TASKS, get_task
+from torchrl_l1.registration import gymnasium_id, register_tasks
 
 register_tasks()
 

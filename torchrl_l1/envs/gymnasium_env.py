@@ -12,7 +12,7 @@ from gymnasium.spaces import Box
 
 from torchrl_l1.envs.simulation import TaskSimulation
 from torchrl_l1.envs.task import Task
-from torchrl_l1.envs.tasks import TASKS, get_task
+from torchrl_l1.envs.tasks import get_task
 
 _ONLY = np.zeros(1, dtype=np.int64)
 
@@ -174,25 +174,3 @@ class MujocoTaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
-
-
-def gymnasium_id(task: str) -> str:
-    """The name under which a task is registered with Gymnasium.
-
-    Examples:
-        >>> gymnasium_id("half_cheetah")
-        'torchrl_l1/HalfCheetah-v0'
-    """
-    return f"torchrl_l1/{task.title().replace('_', '')}-v0"
-
-
-def register_tasks() -> None:
-    """Makes all tasks known to ``gymnasium.make``; importing the package does it."""
-    for name, task in TASKS.items():
-        if gymnasium_id(name) not in gymnasium.registry:
-            gymnasium.register(
-                gymnasium_id(name),
-                entry_point="torchrl_l1.envs.gymnasium_env:MujocoTaskEnv",
-                max_episode_steps=task.horizon,
-                kwargs={"task": name},
-            )

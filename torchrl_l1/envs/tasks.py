@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrl_l1.envs.task import Task
+from torchrl_l1.registration import EPISODE_STEPS
 
 # Swimmer: the front end of its head in the frame of the body "torso", metres along that body.
 SWIMMER_TIP = 1.5
@@ -155,7 +156,7 @@ _INVERTED_PENDULUM = Task(
     model_file="inverted_pendulum.xml",
     timestep=0.02,
     frame_skip=2,
-    horizon=100,
+    horizon=EPISODE_STEPS["inverted_pendulum"],
     observation_dim=4,
     action_dim=1,
     action_low=-3.0,
@@ -179,7 +180,7 @@ _SWIMMER = Task(
     model_file="swimmer.xml",
     timestep=0.01,
     frame_skip=4,
-    horizon=1000,
+    horizon=EPISODE_STEPS["swimmer"],
     observation_dim=9,
     action_dim=2,
     action_low=-1.0,
@@ -197,7 +198,7 @@ _HOPPER = Task(
     model_file="hopper.xml",
     timestep=0.002,
     frame_skip=4,
-    horizon=1000,
+    horizon=EPISODE_STEPS["hopper"],
     observation_dim=11,
     action_dim=3,
     action_low=-1.0,
@@ -215,7 +216,7 @@ _WALKER = Task(
     model_file="walker2d.xml",
     timestep=0.002,
     frame_skip=4,
-    horizon=1000,
+    horizon=EPISODE_STEPS["walker"],
     observation_dim=17,
     action_dim=6,
     action_low=-1.0,
@@ -235,7 +236,7 @@ _HALF_CHEETAH = Task(
     model_file="half_cheetah.xml",
     timestep=0.01,
     frame_skip=5,
-    horizon=1000,
+    horizon=EPISODE_STEPS["half_cheetah"],
     observation_dim=17,
     action_dim=6,
     action_low=-1.0,
@@ -253,7 +254,7 @@ _CARTPOLE = Task(
     model_file=str(Path(__file__).parent / "assets" / "cartpole.xml"),
     timestep=0.02,
     frame_skip=2,
-    horizon=200,
+    horizon=EPISODE_STEPS["cartpole"],
     observation_dim=4,
     action_dim=1,
     action_low=-3.0,

@@ -5,8 +5,18 @@ from __future__ import annotations
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from torchrl_l1.experiment.recipes import RecipeError
-from torchrl_l1.experiment.run_directory import RunDirectoryError
+
+class RecipeError(Exception):
+    """No such recipe; the message lists those that exist."""
+
+
+class RunDirectoryError(Exception):
+    """The run directory cannot be used as asked; the message says why and what to do."""
+
+
+class RunDirectoryInUse(RunDirectoryError):
+    """Another process is running in the run directory."""
+
 
 USER_ERRORS = (
     FileNotFoundError,

@@ -18,6 +18,7 @@ from torchrl_l1.algorithms.collection import (
 )
 from torchrl_l1.algorithms.policy import kinds_of
 from torchrl_l1.envs import DISTURBANCES, Perturbation
+from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.l1_options import (
     closest_option,
     l1_option,
@@ -25,7 +26,7 @@ from torchrl_l1.experiment.l1_options import (
 )
 from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.experiment.recipes import group_setting
-from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError, read_config
+from torchrl_l1.experiment.run_directory import RunDirectory, read_config
 from torchrl_l1.experiment.settings import L1Settings, RunSettings, l1_config, schema_of
 
 

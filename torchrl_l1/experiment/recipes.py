@@ -9,13 +9,10 @@ from typing import Any
 from omegaconf import OmegaConf
 
 import torchrl_l1
+from torchrl_l1.experiment.errors import RecipeError
 
 # Folders beside the recipes: their groups, and matrices of runs.
 _NOT_RECIPES = ("shared", "campaigns")
-
-
-class RecipeError(Exception):
-    """No such recipe; the message lists those that exist."""
 
 
 def recipes_dir() -> Path:

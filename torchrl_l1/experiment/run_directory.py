@@ -20,6 +20,7 @@ from filelock import lock_descriptor, unlock_descriptor
 from omegaconf import OmegaConf
 
 import torchrl_l1
+from torchrl_l1.experiment.errors import RunDirectoryError, RunDirectoryInUse
 from torchrl_l1.experiment.settings import VOLATILE_KEYS, flatten, schema_defaults
 
 PACKAGES = ("torch", "tensordict", "torchrl", "gymnasium", "mujoco", "numpy")
@@ -79,14 +80,6 @@ _BEFORE_CONFIG = (".lock", "versions.json", "versions.json.tmp", "config.yaml.tm
 
 # A run that is asked for more iterations than it had continues; no other setting may change.
 _MAY_GROW = "outer_iterations"
-
-
-class RunDirectoryError(Exception):
-    """The run directory cannot be used as asked; the message says why and what to do."""
-
-
-class RunDirectoryInUse(RunDirectoryError):
-    """Another process is running in the run directory."""
 
 
 @contextmanager

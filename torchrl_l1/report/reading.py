@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_l1.experiment.run_directory import RunDirectoryError
+from torchrl_l1.experiment.errors import RunDirectoryError
 
 SWITCH_RATE = "l1/switch_rate"
 """Column of the switches per step."""
