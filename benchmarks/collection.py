@@ -12,7 +12,7 @@ from torchrl.envs import Transform
 
 from benchmarks.tables import Table
 from benchmarks.timing import Row, interleave, ratio, spread
-from torchrl_l1.algorithms.policy import GaussianPolicy, clipped, make_actor
+from torchrl_l1.algorithms.policy import GaussianPolicy, acting
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Transform
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, fit_ensemble
@@ -49,11 +49,9 @@ def _batches(task: Task, num_envs: int, transforms: list[Transform]) -> Iterator
     """Endless batches of ``STEPS`` steps of every environment, by an untrained policy."""
     torch.manual_seed(0)
     n, m = task.observation_dim, task.action_dim
-    actor = make_actor(GaussianPolicy(n, m, [32, 32], 1.0))
-    low, high = torch.full((m,), task.action_low), torch.full((m,), task.action_high)
     collector = Collector(
         make_env(task, num_envs, extra_transforms=transforms, seed=0),
-        clipped(actor, low, high),
+        acting(GaussianPolicy(n, m, [32, 32], 1.0), task),
         frames_per_batch=STEPS * num_envs,
         total_frames=-1,
         auto_register_policy_transforms=False,
