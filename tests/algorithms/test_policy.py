@@ -38,7 +38,9 @@ def torchrl_actor(policy: GaussianPolicy) -> ProbabilisticActor:
 
 @pytest.mark.parametrize("kind", [kind for kind in ExplorationType if kind.value != "median"])
 @pytest.mark.parametrize("shape", [(), (3,), (50,), (7, 5)])
-def test_the_actor_writes_what_torchrls_own_writes(kind, shape) -> None:
+def test_the_actor_writes_what_torchrls_own_writes(
+    kind: ExplorationType, shape: tuple[int, ...]
+) -> None:
     torch.manual_seed(0)
     policy = GaussianPolicy(3, 2, (8,), std=0.7)
     data = TensorDict({"observation": torch.randn(*shape, 3)}, batch_size=shape)

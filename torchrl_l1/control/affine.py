@@ -81,9 +81,43 @@ def switching_law(
     Returns:
         switch ``(..., 1)`` (bool) and the error ``(..., 1)``.
     """
-    remainder = model.taylor_remainder(observation, u_bar, action)
+    return _exceeds(model.taylor_remainder(observation, u_bar, action), epsilon)
+
+
+def _exceeds(remainder: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
     error = torch.linalg.vector_norm(remainder, dim=-1, keepdim=True)
     return error > epsilon, error
+
+
+def operating_point(
+    model: ActionJacobian,
+    observation: Tensor,
+    u_bar: Tensor,
+    candidate: Tensor,
+    tested: Tensor,
+    started: Tensor,
+    epsilon: float,
+) -> tuple[Tensor, Tensor, Affinization]:
+    """Apply :func:`switching_law` at ``tested`` and affinize the model at the point it selects.
+
+    Args:
+        model: the learned dynamics.
+        observation: ``(..., n)``, raw units.
+        u_bar: the operating input ``(..., m)``.
+        candidate: the input that takes its place at a switch ``(..., m)``.
+        tested: where the affine model around ``u_bar`` is tested ``(..., m)``.
+        started: ``(..., 1)`` bool, false where there is nothing to switch from.
+        epsilon: tolerance, state units.
+
+    Returns:
+        switch ``(..., 1)`` (bool), the error ``(..., 1)`` and the model at the selected point.
+    """
+    remainder, tangent_at = model.expansion(observation, u_bar, candidate, tested)
+    switch, error = _exceeds(remainder, epsilon)
+    # Rounding may separate two evaluations at the same input; a first step never switches.
+    switch = switch & started
+    selected = torch.where(switch, candidate, u_bar)
+    return switch, error, Affinization(selected, *tangent_at(switch))
 
 
 def augment(
@@ -123,12 +157,11 @@ def augment(
     u_rl = law.saturate(config, u_rl)
     u_bar = torch.where(state.started, state.u_bar, u_rl)
     tested = _tested_input(config, model, state, observation, u_rl, u_bar)
-    switch, error = switching_law(model, observation, u_bar, tested, config.epsilon)
-    # Rounding may separate two evaluations at the same input; a first step never switches.
-    switch = switch & state.started
-    u_bar = torch.where(switch, u_rl, u_bar)
-
-    drift, jacobian = affinize(model, observation, u_bar).affine()
+    switch, error, affinization = operating_point(
+        model, observation, u_bar, u_rl, tested, state.started, config.epsilon
+    )
+    u_bar = affinization.u_bar
+    drift, jacobian = affinization.affine()
     restart = switch if config.on_switch == "reset" else None
     u, following, diagnostics = law.step(config, state, observation, u_rl, drift, jacobian, restart)
     finite = following.started
