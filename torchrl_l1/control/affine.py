@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -154,22 +155,39 @@ def augment(
         >>> state.x_hat.squeeze(-1)
         tensor([0.9000, 0.9000, 0.9000])
     """
+    u, following, finish = augment_silently(config, model, state, observation, u_rl)
+    return u, following, finish()
+
+
+def augment_silently(
+    config: L1Config,
+    model: ActionJacobian,
+    state: L1State,
+    observation: Tensor,
+    u_rl: Tensor,
+) -> tuple[Tensor, L1State, Callable[[], L1Diagnostics]]:
+    """:func:`augment` with the diagnostics as a function, which need not be called."""
     u_rl = law.saturate(config, u_rl)
     u_bar = torch.where(state.started, state.u_bar, u_rl)
     tested = _tested_input(config, model, state, observation, u_rl, u_bar)
     switch, error, affinization = operating_point(
         model, observation, u_bar, u_rl, tested, state.started, config.epsilon
     )
-    u_bar = affinization.u_bar
-    drift, jacobian = affinization.affine()
+    u_bar, change, jacobian = affinization
     restart = switch if config.on_switch == "reset" else None
-    u, following, diagnostics = law.step(config, state, observation, u_rl, drift, jacobian, restart)
+    u, following, terms = law.respond(
+        config, state, observation, u_rl, change, jacobian, u_bar, restart
+    )
     finite = following.started
     following = following._replace(
-        u_bar=torch.where(finite, u_bar, 0.0), n_switch=state.n_switch + switch
+        u_bar=u_bar.masked_fill(~finite, 0.0), n_switch=state.n_switch + switch
     )
-    error = torch.where(finite & state.started, error, 0.0)
-    return u, following, diagnostics._replace(switch=switch, affinization_error=error)
+
+    def diagnostics() -> L1Diagnostics:
+        counted = error.masked_fill(~(finite & state.started), 0.0)
+        return law.diagnose(config, terms, switch, counted)
+
+    return u, following, diagnostics
 
 
 def _tested_input(
@@ -185,8 +203,8 @@ def _tested_input(
         return u_rl
     if config.filter_input == "current":
         # The executed input depends on the Jacobian, through this step's estimate.
-        affine = affinize(model, observation, u_bar).affine()
-        return law.step(config, state, observation, u_rl, *affine)[0]
+        change, jacobian = model.value_and_jacobian(observation, u_bar)
+        return law.respond(config, state, observation, u_rl, change, jacobian, u_bar)[0]
     # It does not depend on the operating point: the filter's next state is known.
     adapted = law.saturate(config, u_rl - law.filtered(config, state.q, state.sigma_m))
     return torch.where(state.started, adapted, u_rl)

@@ -193,29 +193,32 @@ class EnsembleMLP(nn.Module):
             ``(E, B, out)`` and derivatives ``(E, B, d, out)`` there.
         """
         activation, batch = _VALUE_AND_DERIVATIVE[self.activation], x.shape[1]
+        # Once each: a ParameterList takes as long to read as a small sum.
         weights, biases = list(self.weights), list(self.biases)
-        members = self.members
-        hidden = x.flatten(0, 1).expand(members, -1, -1)
-        remainder = torch.zeros_like(hidden[:, :batch])
+        hidden = x.flatten(0, 1).expand(self.members, -1, -1)
+        tangent = hidden[:, 2 * batch :] - hidden[:, :batch]
         derivatives: list[Tensor] = []
         for layer, (weight, bias) in enumerate(zip(weights[:-1], biases[:-1], strict=True)):
             if layer == 0:
-                z = torch.bmm(hidden, weight) + bias
+                z = torch.bmm(hidden, weight).add_(bias)
                 tangent = z[:, 2 * batch :] - z[:, :batch]
             else:
                 stacked = torch.bmm(torch.cat([hidden, tangent], 1), weight)
-                z, tangent = stacked[:, : 3 * batch] + bias, stacked[:, 3 * batch :]
+                z, tangent = stacked[:, : 3 * batch].add_(bias), stacked[:, 3 * batch :]
             hidden, derivative = activation(z)
             derivatives.append(derivative)
-            tangent = derivative[:, :batch] * tangent
-            remainder = hidden[:, 2 * batch :] - hidden[:, :batch] - tangent
+            tangent.mul_(derivative[:, :batch])
+        remainder = hidden[:, 2 * batch :] - hidden[:, :batch] - tangent
 
         def at(moved: Tensor) -> tuple[Tensor, Tensor]:
             rows = torch.arange(batch, device=x.device) + batch * moved
-            value = torch.bmm(hidden.index_select(1, rows), weights[-1]) + biases[-1]
+            value = torch.bmm(hidden.index_select(1, rows), weights[-1]).add_(biases[-1])
             tangents = weights[0][:, None, first:last].expand(-1, batch, -1, -1)
-            for derivative, weight in zip(derivatives, weights[1:], strict=True):
-                tangents = tangents * derivative.index_select(1, rows)[:, :, None]
+            for layer, (derivative, weight) in enumerate(
+                zip(derivatives, weights[1:], strict=True)
+            ):
+                slopes = derivative.index_select(1, rows)[:, :, None]
+                tangents = tangents.mul_(slopes) if layer else tangents * slopes
                 tangents = torch.bmm(tangents.flatten(1, 2), weight)
                 tangents = tangents.unflatten(1, (batch, last - first))
             return value, tangents
