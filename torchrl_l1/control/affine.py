@@ -178,13 +178,12 @@ def augment_silently(
     u, following, terms = law.respond(
         config, state, observation, u_rl, change, jacobian, u_bar, restart
     )
-    finite = following.started
     following = following._replace(
-        u_bar=u_bar.masked_fill(~finite, 0.0), n_switch=state.n_switch + switch
+        u_bar=u_bar.masked_fill(terms.non_finite, 0.0), n_switch=state.n_switch + switch
     )
 
     def diagnostics() -> L1Diagnostics:
-        counted = error.masked_fill(~(finite & state.started), 0.0)
+        counted = error.masked_fill(terms.non_finite | ~state.started, 0.0)
         return law.diagnose(config, terms, switch, counted)
 
     return u, following, diagnostics

@@ -198,7 +198,7 @@ class Terms(NamedTuple):
         q: next filter state ``(..., m)``.
         cut: entries of the action that a bound cut ``(..., m)``, bool.
         ill_conditioned: see :func:`solve_matched`.
-        finite: whether the step could be taken ``(..., 1)``, bool.
+        non_finite: an input was not finite ``(..., 1)``, bool.
     """
 
     x_err: Tensor
@@ -207,7 +207,7 @@ class Terms(NamedTuple):
     q: Tensor
     cut: Tensor
     ill_conditioned: Tensor
-    finite: Tensor
+    non_finite: Tensor
 
 
 def respond(
@@ -261,16 +261,17 @@ def respond(
     x_hat = x_hat + change + effect_u - x_err * _like(x_err, config.predictor_gain)
 
     finite = _is_finite(x_hat)
+    non_finite = ~finite
     # The least squares gives finite numbers whatever it gets, so q and sigma_m need no care.
     following = L1State(
-        x_hat=x_hat.masked_fill(~finite, 0.0),
+        x_hat=x_hat.masked_fill(non_finite, 0.0),
         u_bar=state.u_bar,
         q=q,
         sigma_m=sigma_m,
         n_switch=state.n_switch,
         started=finite,
     )
-    terms = Terms(x_err, estimate, effect_matched, q, u != unbounded, ill_conditioned, finite)
+    terms = Terms(x_err, estimate, effect_matched, q, u != unbounded, ill_conditioned, non_finite)
     return torch.where(finite, u, u_rl), following, terms
 
 
@@ -287,14 +288,13 @@ def diagnose(
     affinization_error: Tensor | None = None,
 ) -> L1Diagnostics:
     """The diagnostics of a step, with those of the switching law if they are given."""
-    x_err, estimate, effect_matched, q, cut, ill_conditioned, finite = terms
+    x_err, estimate, effect_matched, q, cut, ill_conditioned, non_finite = terms
     norms = torch.linalg.vector_norm(
         torch.stack([x_err, effect_matched, estimate - effect_matched], dim=-2), dim=-1
     )
-    non_finite = ~finite
     prediction_error, matched, unmatched = norms.masked_fill(non_finite, 0.0).split(1, dim=-1)
     return L1Diagnostics(
-        switch=torch.zeros_like(finite) if switch is None else switch,
+        switch=torch.zeros_like(non_finite) if switch is None else switch,
         affinization_error=(
             torch.zeros_like(prediction_error) if affinization_error is None else affinization_error
         ),
@@ -302,7 +302,7 @@ def diagnose(
         matched=matched / config.dt,
         unmatched=unmatched / config.dt,
         u_a=torch.linalg.vector_norm(q, dim=-1, keepdim=True),
-        saturation=(cut & finite).to(q.dtype).mean(-1, keepdim=True),
+        saturation=(cut & ~non_finite).to(q.dtype).mean(-1, keepdim=True),
         ill_conditioned=ill_conditioned,
         non_finite=non_finite,
     )
