@@ -13,6 +13,7 @@ from benchmarks import (
     env_stepping,
     fitting,
     jacobian,
+    l1_scaling,
     planning,
     planning_precision,
     shooting,
@@ -25,6 +26,7 @@ RESULTS = Path(__file__).parent / "results"
 # Name: (threads, default repetitions, measurement).
 BENCHMARKS: dict[str, tuple[int, int, Callable[[int], Table]]] = {
     "jacobian": (jacobian.THREADS, 21, jacobian.table),
+    "l1_scaling": (l1_scaling.THREADS, 9, l1_scaling.table),
     "env_stepping": (env_stepping.THREADS, 9, env_stepping.table),
     "collection": (collection.THREADS, 7, collection.table),
     "planning": (planning.THREADS, 9, planning.table),

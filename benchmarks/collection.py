@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from itertools import count
 
 import torch
-from tensordict import TensorDictBase
-from torchrl.collectors import Collector
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.envs import Transform
+from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from benchmarks.tables import Table
 from benchmarks.timing import Row, interleave, ratio, spread
-from torchrl_l1.algorithms.policy import GaussianPolicy, clipped, make_actor
+from torchrl_l1.algorithms.collection import Collection
+from torchrl_l1.algorithms.policy import GaussianPolicy, acting
 from torchrl_l1.compilation import CompileMode
-from torchrl_l1.control import L1Transform
+from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, fit_ensemble
-from torchrl_l1.envs import Task, get_task, make_env
+from torchrl_l1.envs import Perturbation, Task, get_task, make_env
 
 SETTINGS = (("inverted_pendulum", 25, 1.0), ("half_cheetah", 6, 3.0), ("half_cheetah", 25, 3.0))
 """Task, number of environments, epsilon."""
@@ -28,6 +29,7 @@ COMPILE: dict[str, CompileMode] = {"eager": False, "compiled": "auto"}
 """Variants with L1 on."""
 
 THREADS = 2
+THREAD_COUNTS = (1, 2)
 STEPS = 100
 FIT = FitConfig(max_gradient_steps=300)
 
@@ -45,63 +47,81 @@ def fitted_model(task: Task, width: int, fit: FitConfig) -> EnsembleDynamics:
     return model
 
 
-def _batches(task: Task, num_envs: int, transforms: list[Transform]) -> Iterator[TensorDictBase]:
-    """Endless batches of ``STEPS`` steps of every environment, by an untrained policy."""
+def _policies(task: Task) -> dict[str, TensorDictModuleBase]:
+    """An untrained policy behind the actor that collects, and behind TorchRL's own."""
     torch.manual_seed(0)
-    n, m = task.observation_dim, task.action_dim
-    actor = make_actor(GaussianPolicy(n, m, [32, 32], 1.0))
-    low, high = torch.full((m,), task.action_low), torch.full((m,), task.action_high)
-    collector = Collector(
-        make_env(task, num_envs, extra_transforms=transforms, seed=0),
-        clipped(actor, low, high),
-        frames_per_batch=STEPS * num_envs,
-        total_frames=-1,
-        auto_register_policy_transforms=False,
+    policy = GaussianPolicy(task.observation_dim, task.action_dim, [32, 32], 1.0)
+    actor = ProbabilisticActor(
+        TensorDictModule(policy, in_keys=["observation"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        out_keys=["action"],
+        distribution_class=IndependentNormal,
     )
-    return iter(collector)
+    clip = TensorDictModule(
+        lambda action: action.clamp(task.action_low, task.action_high), ["action"], ["action"]
+    )
+    return {"light": acting(policy, task), "torchrl": TensorDictSequential(actor, clip)}
 
 
-def run(repetitions: int) -> list[Row]:
+def _collecting(collection: Collection) -> Callable[[], object]:
+    iterations = count()
+    return lambda: collection.collect(0, next(iterations))
+
+
+def run(repetitions: int, threads: tuple[int, ...] = THREAD_COUNTS) -> list[Row]:
     """Measure all settings.
 
     Args:
-        repetitions: interleaved measurements of each variant; one is a batch of the collector.
+        repetitions: interleaved measurements of each variant; one is ``STEPS`` steps of every
+            environment.
+        threads: numbers of threads of torch, one after the other.
 
     Returns:
-        One row per setting and width: switches per 1000 steps (``switches``), real steps per second
-        with L1 ``off``, on and ``eager``, on and ``compiled``; ``eager_ratio`` and
-        ``compiled_ratio`` are fractions of the speed without L1.
+        One row per number of threads, setting and width: switches per 1000 steps (``switches``),
+        real steps per second with L1 ``off``, on and ``eager``, on and ``compiled``, and without
+        L1 with TorchRL's own actor (``torchrl``); ``eager_ratio`` and ``compiled_ratio`` are
+        fractions of the speed without L1, ``actor_ratio`` is the gain over ``torchrl``.
     """
     rows: list[Row] = []
     models: dict[tuple[str, int], EnsembleDynamics] = {}
-    for name, num_envs, epsilon in SETTINGS:
-        task = get_task(name)
-        for width in WIDTHS:
-            if (name, width) not in models:
-                models[name, width] = fitted_model(task, width, FIT)
-            model = models[name, width]
-            variants: dict[str, list[Transform]] = {"off": []} | {
-                variant: [L1Transform(model, dt=task.dt, epsilon=epsilon, compile=mode)]
-                for variant, mode in COMPILE.items()
-            }
-            batches = {
-                variant: _batches(task, num_envs, transforms)
-                for variant, transforms in variants.items()
-            }
-            switches = next(batches["eager"])["next", "l1", "switch"].float().mean().item()
-            cases: dict[str, Callable[[], object]] = {
-                variant: iterator.__next__ for variant, iterator in batches.items()
-            }
-            # Two batches to warm up: torch compiles at the first.
-            seconds = interleave(cases, repetitions)
-            row: Row = {"task": name, "num_envs": num_envs, "model": f"2 x {width}"}
-            row["switches"] = 1000 * switches
-            for variant, values in seconds.items():
-                row |= spread(variant, [STEPS * num_envs / value for value in values])
-            for variant in COMPILE:
-                row |= ratio(f"{variant}_ratio", seconds["off"], seconds[variant])
-            rows.append(row)
+    before = torch.get_num_threads()
+    for threads_now in threads:
+        torch.set_num_threads(threads_now)
+        for name, num_envs, epsilon in SETTINGS:
+            task = get_task(name)
+            for width in WIDTHS:
+                if (name, width) not in models:
+                    models[name, width] = fitted_model(task, width, FIT)
+                measured = _measure(task, num_envs, epsilon, models[name, width], repetitions)
+                row: Row = {"threads": threads_now, "task": name, "num_envs": num_envs}
+                rows.append(row | {"model": f"2 x {width}"} | measured)
+    torch.set_num_threads(before)
     return rows
+
+
+def _measure(
+    task: Task, num_envs: int, epsilon: float, model: EnsembleDynamics, repetitions: int
+) -> Row:
+    policies = _policies(task)
+    l1 = L1Config(task.dt, epsilon=epsilon)
+    arms: dict[str, tuple[str, L1Config | None, CompileMode]] = {"off": ("light", None, False)}
+    arms |= {variant: ("light", l1, mode) for variant, mode in COMPILE.items()}
+    arms["torchrl"] = ("torchrl", None, False)
+    collections = {
+        name: Collection(
+            task, num_envs, policies[actor], model, config, Perturbation(), STEPS, mode
+        )
+        for name, (actor, config, mode) in arms.items()
+    }
+    signals = collections["eager"].collect(0, 0)["next", "l1"]
+    # Two batches to warm up: torch compiles at the first.
+    seconds = interleave({name: _collecting(arm) for name, arm in collections.items()}, repetitions)
+    row: Row = {"switches": 1000 * signals["switch"].float().mean().item()}
+    for variant, values in seconds.items():
+        row |= spread(variant, [STEPS * num_envs / value for value in values])
+    for variant in COMPILE:
+        row |= ratio(f"{variant}_ratio", seconds["off"], seconds[variant])
+    return row | ratio("actor_ratio", seconds["torchrl"], seconds["off"])
 
 
 def table(repetitions: int) -> Table:
@@ -109,20 +129,24 @@ def table(repetitions: int) -> Table:
     return Table(
         "collection",
         "Collection with L1 on and off",
-        "Real steps per second of a `Collector`, median (range); the ratios are fractions of the "
-        "speed without L1. Five members of ReLU units, fitted to random data; an untrained policy. "
-        "Where there is no working compiler, `compiled` runs eagerly.",
+        "Real steps per second of a `Collection`, median (range); the ratios of L1 are fractions "
+        "of the speed without it, that of the actor is the gain over TorchRL's own actor without "
+        "L1. Five members of ReLU units, fitted to random data; an untrained policy. Where there "
+        "is no working compiler, `compiled` runs eagerly.",
         run(repetitions),
         {
+            "threads": "threads",
             "task": "task",
             "num_envs": "environments",
             "model": "model",
             "switches": "switches per 1000 steps",
+            "torchrl": "L1 off, TorchRL's actor",
             "off": "L1 off",
             "eager": "L1 on, eager",
             "compiled": "L1 on, compiled",
             "eager_ratio": "eager / off",
             "compiled_ratio": "compiled / off",
+            "actor_ratio": "off / TorchRL's actor",
         },
-        dict.fromkeys(("off", "eager", "compiled", "switches"), ",.0f"),
+        dict.fromkeys(("torchrl", "off", "eager", "compiled", "switches"), ",.0f"),
     )

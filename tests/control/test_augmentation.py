@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from torchrl_l1.control import ActionJacobian, L1Config, augment, init
+from torchrl_l1.dynamics import EnsembleDynamics
 
 N, M, DT = 4, 2, 0.05
 RNG = np.random.default_rng(0)
@@ -153,3 +154,63 @@ def test_captures_as_one_graph(on_switch, switch_on, filter_input):
     captured = torch.compile(step, fullgraph=True, backend="eager")
     for a, b in zip(run(step), run(captured), strict=True):
         torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
+
+
+class Counting(EnsembleDynamics):
+    """Counts passes through the network."""
+
+    def __init__(self, *args, **settings):
+        super().__init__(*args, **settings)
+        self.passes = []
+
+    def expansion(self, *args):
+        self.passes.append("expansion")
+        return super().expansion(*args)
+
+    def value_and_jacobian(self, *args):
+        self.passes.append("value_and_jacobian")
+        return super().value_and_jacobian(*args)
+
+    def taylor_remainder(self, *args):
+        self.passes.append("taylor_remainder")
+        return super().taylor_remainder(*args)
+
+    def mean_change(self, *args):
+        self.passes.append("mean_change")
+        return super().mean_change(*args)
+
+
+@pytest.mark.parametrize(("on_switch", "switch_on", "filter_input"), CHOICES)
+@torch.no_grad()
+def test_an_ensemble_is_evaluated_once_and_as_any_other_model(on_switch, switch_on, filter_input):
+    torch.manual_seed(0)
+    model = Counting(N, M, members=3, hidden=(16, 16), activation="silu").double()
+    config = L1Config(
+        DT,
+        epsilon=0.02,
+        on_switch=on_switch,
+        switch_on=switch_on,
+        filter_input=filter_input,
+        action_low=-1.0,
+        action_high=1.0,
+    )
+    # As a function of the two tensors it is differentiated automatically, piece by piece.
+    other = ActionJacobian(lambda x, u: EnsembleDynamics.mean_change(model, x, u))
+    states = [init([5], N, M, dtype=torch.float64)] * 2
+    for _ in range(30):
+        x = torch.randn(5, N, dtype=torch.float64)
+        u_rl = 2 * torch.randn(5, M, dtype=torch.float64)
+        model.passes.clear()
+        results = [
+            augment(config, *both, x, u_rl)
+            for both in zip((ActionJacobian(model), other), states, strict=True)
+        ]
+        # Where the tested input depends on the estimate, that takes a Jacobian first.
+        depends = switch_on == "executed" and filter_input == "current"
+        assert model.passes == ["value_and_jacobian"] * depends + ["expansion"]
+        for found, expected in zip(
+            *((u, *state, *signals) for u, state, signals in results), strict=True
+        ):
+            torch.testing.assert_close(found, expected, atol=1e-11, rtol=1e-9)
+        states = [state for _, state, _ in results]
+    assert 0 < states[0].n_switch.sum() < 150

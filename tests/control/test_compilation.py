@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import shutil
 import sys
 import sysconfig
@@ -10,8 +11,8 @@ import torch
 from torch._dynamo.exc import FailOnRecompileLimitHit, TorchDynamoException
 
 from torchrl_l1.compilation import compiled
-from torchrl_l1.control import ActionJacobian, L1Config, augment, init
-from torchrl_l1.control.layout import make_step
+from torchrl_l1.control import ActionJacobian, L1Config, augment, init, law
+from torchrl_l1.control.layout import BLOCK, make_step
 from torchrl_l1.dynamics import EnsembleDynamics
 
 HEADERS = Path(sysconfig.get_path("include")) / "Python.h"
@@ -47,6 +48,55 @@ def test_compiled_step_agrees_and_sees_weights_updated_in_place():
     after = trajectory(step)
     torch.testing.assert_close(after, trajectory(eager), atol=1e-5, rtol=1e-5)
     assert not torch.allclose(before, after)
+
+
+@pytest.mark.parametrize("batch", [(2 * BLOCK + 5,), (3, 100), ()])
+@torch.no_grad()
+def test_blocks_of_rows_are_the_batch(batch):
+    torch.manual_seed(0)
+    model = EnsembleDynamics(4, 2, members=2, hidden=(16, 16))
+    config = L1Config(0.04, epsilon=0.05, action_low=-1.0, action_high=1.0)
+    sizes = []
+    expansion = model.expansion
+
+    def counting(observation, *actions):
+        sizes.append(observation.shape[:-1].numel())
+        return expansion(observation, *actions)
+
+    model.expansion = counting
+    step = make_step(config, ActionJacobian(model), False)
+    states = [init(batch, 4, 2)] * 2
+    for _ in range(4):
+        x, u_rl = torch.randn(*batch, 4), torch.randn(*batch, 2)
+        sizes.clear()
+        blocked = step(states[0], x, u_rl)
+        assert sum(sizes) == math.prod(batch) and max(sizes) <= BLOCK
+        results = (blocked, augment(config, ActionJacobian(model), states[1], x, u_rl))
+        flat = [(u, *state, *signals) for u, state, signals in results]
+        for found, expected in zip(*flat, strict=True):
+            assert found.shape == expected.shape and found.dtype == expected.dtype
+            torch.testing.assert_close(found, expected, atol=1e-6, rtol=1e-5)
+        states = [state for _, state, _ in results]
+
+
+@torch.no_grad()
+def test_a_model_of_another_kind_sees_the_whole_batch():
+    gains = torch.rand(2 * BLOCK, 1)
+    step = make_step(L1Config(0.04), ActionJacobian(lambda x, u: gains * u + 0.1 * x), False)
+    u, state, _ = step(init([2 * BLOCK], 1, 1), torch.zeros(2 * BLOCK, 1), torch.ones(2 * BLOCK, 1))
+    assert torch.equal(u, torch.ones_like(u))
+    torch.testing.assert_close(state.x_hat, gains)
+
+
+@torch.no_grad()
+def test_without_diagnostics_they_are_not_computed(monkeypatch):
+    model = ActionJacobian(EnsembleDynamics(4, 1, members=2, hidden=(8,)))
+    config = L1Config(0.04, epsilon=0.05, action_low=-1.0, action_high=1.0)
+    expected = trajectory(make_step(config, model, False))
+    monkeypatch.setattr(law, "diagnose", None)
+    silent = make_step(config, model, False, diagnostics=False)
+    assert silent(init([3], 4, 1), torch.zeros(3, 4), torch.zeros(3, 1))[2] is None
+    assert torch.equal(trajectory(silent), expected)
 
 
 @torch.no_grad()

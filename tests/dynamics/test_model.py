@@ -7,7 +7,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchrl_l1.dynamics import EnsembleDynamics, EnsembleModelEnv, imagine, make_dynamics
+from torchrl_l1.dynamics import (
+    ControlAffineDynamics,
+    EnsembleDynamics,
+    EnsembleModelEnv,
+    GaussianHead,
+    imagine,
+    make_dynamics,
+)
+from torchrl_l1.dynamics.ensemble import ActivationName
 
 FORMS = ["nonlinear", "affine"]
 
@@ -117,3 +125,41 @@ def test_imagination_draws_from_the_elites(elites: list[int]) -> None:
     path = env.rollout(60)
     steps = path["next", "observation"] - path["observation"]
     assert set(steps.flatten().int().tolist()) == set(elites)
+
+
+@pytest.mark.parametrize("activation", ["relu", "tanh", "silu"])
+@pytest.mark.parametrize("hidden", [(), (9,), (9, 8, 7)])
+@pytest.mark.parametrize("form", ["nonlinear", "affine"])
+@torch.no_grad()
+def test_the_expansion_is_remainder_and_tangent_of_either_point(
+    form: str, hidden: tuple[int, ...], activation: ActivationName
+) -> None:
+    torch.manual_seed(0)
+    kind = EnsembleDynamics if form == "nonlinear" else ControlAffineDynamics
+    model = kind(3, 2, 4, hidden, activation, head=GaussianHead(3)).double()
+    data = torch.randn(3, 50, 3, dtype=torch.float64)
+    model.fit_statistics(data[0] + 1, 2 * data[1, :, :2] - 0.5, 0.3 * data[2])
+    model.set_elites([0, 2, 3])
+    observation = torch.randn(2, 5, 3, dtype=torch.float64)
+    u_bar, candidate, tested = torch.randn(3, 2, 5, 2, dtype=torch.float64)
+    moved = torch.tensor([[0, 1, 0, 0, 1], [1, 1, 0, 0, 0]]).bool().unsqueeze(-1)
+    remainder, tangent_at = model.expansion(observation, u_bar, candidate, tested)
+    found = (remainder, *tangent_at(moved), *tangent_at(~moved))
+    expected = [
+        model.taylor_remainder(observation, u_bar, tested),
+        *model.value_and_jacobian(observation, torch.where(moved, candidate, u_bar)),
+        *model.value_and_jacobian(observation, torch.where(moved, u_bar, candidate)),
+    ]
+    for ours, theirs in zip(found, expected, strict=True):
+        torch.testing.assert_close(ours, theirs, atol=1e-13, rtol=1e-12)
+
+
+@torch.no_grad()
+def test_the_expansion_is_blind_to_what_was_not_selected() -> None:
+    torch.manual_seed(0)
+    model = make("nonlinear")
+    x, u = torch.randn(4, 3).double(), torch.randn(4, 2).double()
+    remainder, tangent_at = model.expansion(x, u, torch.full_like(u, torch.nan), u)
+    assert not remainder.any()
+    for value in tangent_at(torch.zeros(4, 1, dtype=torch.bool)):
+        assert value.isfinite().all()

@@ -130,6 +130,9 @@ class Collection:
             frames_per_batch=self.frames,
             total_frames=-1,
             reset_at_each_iter=True,
+            # Otherwise every entry is checked for its device, twice a step.
+            device=env.device,
+            track_traj_ids=False,
             exploration_type=ExplorationType.RANDOM,
             auto_register_policy_transforms=False,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -81,9 +82,43 @@ def switching_law(
     Returns:
         switch ``(..., 1)`` (bool) and the error ``(..., 1)``.
     """
-    remainder = model.taylor_remainder(observation, u_bar, action)
+    return _exceeds(model.taylor_remainder(observation, u_bar, action), epsilon)
+
+
+def _exceeds(remainder: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
     error = torch.linalg.vector_norm(remainder, dim=-1, keepdim=True)
     return error > epsilon, error
+
+
+def operating_point(
+    model: ActionJacobian,
+    observation: Tensor,
+    u_bar: Tensor,
+    candidate: Tensor,
+    tested: Tensor,
+    started: Tensor,
+    epsilon: float,
+) -> tuple[Tensor, Tensor, Affinization]:
+    """Apply :func:`switching_law` at ``tested`` and affinize the model at the point it selects.
+
+    Args:
+        model: the learned dynamics.
+        observation: ``(..., n)``, raw units.
+        u_bar: the operating input ``(..., m)``.
+        candidate: the input that takes its place at a switch ``(..., m)``.
+        tested: where the affine model around ``u_bar`` is tested ``(..., m)``.
+        started: ``(..., 1)`` bool, false where there is nothing to switch from.
+        epsilon: tolerance, state units.
+
+    Returns:
+        switch ``(..., 1)`` (bool), the error ``(..., 1)`` and the model at the selected point.
+    """
+    remainder, tangent_at = model.expansion(observation, u_bar, candidate, tested)
+    switch, error = _exceeds(remainder, epsilon)
+    # Rounding may separate two evaluations at the same input; a first step never switches.
+    switch = switch & started
+    selected = torch.where(switch, candidate, u_bar)
+    return switch, error, Affinization(selected, *tangent_at(switch))
 
 
 def augment(
@@ -120,23 +155,38 @@ def augment(
         >>> state.x_hat.squeeze(-1)
         tensor([0.9000, 0.9000, 0.9000])
     """
+    u, following, finish = augment_silently(config, model, state, observation, u_rl)
+    return u, following, finish()
+
+
+def augment_silently(
+    config: L1Config,
+    model: ActionJacobian,
+    state: L1State,
+    observation: Tensor,
+    u_rl: Tensor,
+) -> tuple[Tensor, L1State, Callable[[], L1Diagnostics]]:
+    """:func:`augment` with the diagnostics as a function, which need not be called."""
     u_rl = law.saturate(config, u_rl)
     u_bar = torch.where(state.started, state.u_bar, u_rl)
     tested = _tested_input(config, model, state, observation, u_rl, u_bar)
-    switch, error = switching_law(model, observation, u_bar, tested, config.epsilon)
-    # Rounding may separate two evaluations at the same input; a first step never switches.
-    switch = switch & state.started
-    u_bar = torch.where(switch, u_rl, u_bar)
-
-    drift, jacobian = affinize(model, observation, u_bar).affine()
-    restart = switch if config.on_switch == "reset" else None
-    u, following, diagnostics = law.step(config, state, observation, u_rl, drift, jacobian, restart)
-    finite = following.started
-    following = following._replace(
-        u_bar=torch.where(finite, u_bar, 0.0), n_switch=state.n_switch + switch
+    switch, error, affinization = operating_point(
+        model, observation, u_bar, u_rl, tested, state.started, config.epsilon
     )
-    error = torch.where(finite & state.started, error, 0.0)
-    return u, following, diagnostics._replace(switch=switch, affinization_error=error)
+    u_bar, change, jacobian = affinization
+    restart = switch if config.on_switch == "reset" else None
+    u, following, terms = law.respond(
+        config, state, observation, u_rl, change, jacobian, u_bar, restart
+    )
+    following = following._replace(
+        u_bar=u_bar.masked_fill(terms.non_finite, 0.0), n_switch=state.n_switch + switch
+    )
+
+    def diagnostics() -> L1Diagnostics:
+        counted = error.masked_fill(terms.non_finite | ~state.started, 0.0)
+        return law.diagnose(config, terms, switch, counted)
+
+    return u, following, diagnostics
 
 
 def _tested_input(
@@ -152,8 +202,8 @@ def _tested_input(
         return u_rl
     if config.filter_input == "current":
         # The executed input depends on the Jacobian, through this step's estimate.
-        affine = affinize(model, observation, u_bar).affine()
-        return law.step(config, state, observation, u_rl, *affine)[0]
+        change, jacobian = model.value_and_jacobian(observation, u_bar)
+        return law.respond(config, state, observation, u_rl, change, jacobian, u_bar)[0]
     # It does not depend on the operating point: the filter's next state is known.
     adapted = law.saturate(config, u_rl - law.filtered(config, state.q, state.sigma_m))
     return torch.where(state.started, adapted, u_rl)

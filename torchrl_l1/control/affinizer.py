@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
-from torchrl_l1.control.affine import affinize, switching_law
+from torchrl_l1.control.affine import affinize, operating_point
 from torchrl_l1.control.jacobian import Predicts
 from torchrl_l1.control.layout import (
     Dynamics,
@@ -112,9 +112,9 @@ class Affinizer(TensorDictModuleBase):
         else:
             u_bar, started = (self._memory(tensordict, name) for name in _STATE)
             u_bar = torch.where(started, u_bar, action)
-            switch, error = switching_law(self.model, observation, u_bar, action, self.epsilon)
-            switch = switch & started
-            affinization = affinize(self.model, observation, torch.where(switch, action, u_bar))
+            switch, error, affinization = operating_point(
+                self.model, observation, u_bar, action, action, started, self.epsilon
+            )
             tensordict.set((self.key, "switch"), switch)
             tensordict.set((self.key, "error"), torch.where(started, error, 0.0))
             following = TensorDict(

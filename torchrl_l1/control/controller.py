@@ -107,7 +107,7 @@ class L1Controller(TensorDictModuleBase):
         self.in_keys = [observation_key, action_key, *((key, name) for name in L1State._fields)]
         self.out_keys = [action_key, (key, "u_rl")]
         self.out_keys += [("next", key, name) for name in (*L1State._fields, "u_exec")]
-        self._step = make_step(config, self.model, compile)
+        self._step = make_step(config, self.model, compile, diagnostics)
 
     def make_primer(self) -> TensorDictPrimer:
         """Transform that gives the environment the controller's state, zero at every reset."""
@@ -136,7 +136,6 @@ class L1Controller(TensorDictModuleBase):
             owner="L1Controller",
             remedy="append the primer to the environment, "
             "TransformedEnv(env, controller.make_primer())",
-            diagnostics=self.diagnostics,
         )
         tensordict.set((self.key, "u_rl"), u_rl)
         tensordict.set(self.action_key, executed)
@@ -149,4 +148,4 @@ class L1Controller(TensorDictModuleBase):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
-        self._step = make_step(self.config, self.model, self.compile_mode)
+        self._step = make_step(self.config, self.model, self.compile_mode, self.diagnostics)

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 Predicts = Literal["change", "next_observation"]
 ChangeFunction = Callable[[Tensor, Tensor], Tensor]
+Expansion = tuple[Tensor, Callable[[Tensor], tuple[Tensor, Tensor]]]
 
 
 @runtime_checkable
@@ -24,7 +25,9 @@ class DynamicsModel(Protocol):
     change ``(..., n)`` together with its derivative with respect to the action ``(..., n, m)``
     in raw units; it is then used in place of automatic differentiation. So is
     ``taylor_remainder(observation, u_bar, action)``, which returns what the tangent at ``u_bar``
-    misses of the change at ``action`` ``(..., n)``.
+    misses of the change at ``action`` ``(..., n)``, and ``expansion(observation, u_bar,
+    candidate, tested)``, which joins the two, see :meth:`ActionJacobian.expansion`. The controller
+    evaluates the latter in blocks of a batch's rows, each of which must depend on no other.
     """
 
     def mean_change(self, observation: Tensor, action: Tensor) -> Tensor:
@@ -177,6 +180,29 @@ class ActionJacobian:
                 lambda u: self.value(observation, u), (u_bar,), (step,)
             )
         return self.value(observation, action) - value - slope
+
+    @property
+    def blockwise(self) -> bool:
+        """Whether a batch may be evaluated in parts: the model has an ``expansion``."""
+        return callable(getattr(self.dynamics, "expansion", None))
+
+    def expansion(
+        self, observation: Tensor, u_bar: Tensor, candidate: Tensor, tested: Tensor
+    ) -> Expansion:
+        """:meth:`taylor_remainder` at ``tested``, then the tangent at ``u_bar`` or ``candidate``.
+
+        Returns:
+            what the tangent at ``u_bar`` misses at ``tested`` ``(..., n)``, and a function of a
+            mask ``(..., 1)``, true where the candidate is selected, that returns
+            :meth:`value_and_jacobian` there.
+        """
+        if self.blockwise:
+            return self.dynamics.expansion(observation, u_bar, candidate, tested)  # type: ignore[union-attr]
+
+        def at(moved: Tensor) -> tuple[Tensor, Tensor]:
+            return self.value_and_jacobian(observation, torch.where(moved, candidate, u_bar))
+
+        return self.taylor_remainder(observation, u_bar, tested), at
 
     def _forward_mode(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         def push_forward(tangent: Tensor) -> tuple[Tensor, ...]:

@@ -182,11 +182,63 @@ def step(
         >>> state.x_hat[0]
         tensor([0.5000, 0.5000, 0.5000])
     """
-    _check_shapes(state, observation, u_rl, drift, jacobian, restart)
+    u, following, terms = respond(
+        config, state, observation, saturate(config, u_rl), drift, jacobian, restart=restart
+    )
+    return u, following, diagnose(config, terms, restart)
+
+
+class Terms(NamedTuple):
+    """What of a step :func:`diagnose` makes its signals of, in state units per step.
+
+    Attributes:
+        x_err: state prediction error ``(..., n)``.
+        estimate: the uncertainty estimate ``(..., n)``.
+        effect_matched: its part that an action could cancel ``(..., n)``.
+        q: next filter state ``(..., m)``.
+        cut: entries of the action that a bound cut ``(..., m)``, bool.
+        ill_conditioned: see :func:`solve_matched`.
+        non_finite: an input was not finite ``(..., 1)``, bool.
+    """
+
+    x_err: Tensor
+    estimate: Tensor
+    effect_matched: Tensor
+    q: Tensor
+    cut: Tensor
+    ill_conditioned: Tensor
+    non_finite: Tensor
+
+
+def respond(
+    config: L1Config,
+    state: L1State,
+    observation: Tensor,
+    u_rl: Tensor,
+    change: Tensor,
+    jacobian: Tensor,
+    u_bar: Tensor | None = None,
+    restart: Tensor | None = None,
+) -> tuple[Tensor, L1State, Terms]:
+    """:func:`step` without its diagnostics, on ``x' = x + change + jacobian (u - u_bar)``.
+
+    Args:
+        config: the settings.
+        state: as in :func:`step`.
+        observation: as in :func:`step`.
+        u_rl: the policy's action within its bounds ``(..., m)``.
+        change: of the model at ``u_bar`` ``(..., n)``, state units per step.
+        jacobian: as in :func:`step`.
+        u_bar: operating point ``(..., m)``; zero if ``None``.
+        restart: as in :func:`step`.
+
+    Returns:
+        the executed input, the next state (but for what a switch changes) and what
+        :func:`diagnose` needs.
+    """
+    _check_shapes(state, observation, u_rl, change, jacobian, restart)
     fresh = ~state.started if restart is None else ~state.started | restart
-    u_rl = saturate(config, u_rl)
     x_hat = torch.where(fresh, observation, state.x_hat)
-    q = torch.where(fresh, 0.0, state.q)
 
     # State prediction error, estimate and its matched part. Everything is in state units per
     # step here: this is T sigma_hat, so that no division by a small T enters the state.
@@ -197,43 +249,63 @@ def step(
 
     # Control input.
     if config.filter_input == "previous":
-        q = filtered(config, q, torch.where(fresh, 0.0, state.sigma_m))
+        q = filtered(config, state.q, state.sigma_m).masked_fill(fresh, 0.0)
     else:
-        q = filtered(config, q, sigma_m)
+        q = filtered(config, state.q.masked_fill(fresh, 0.0), sigma_m)
     unbounded = u_rl - q
     u = saturate(config, unbounded)
 
     # State predictor.
-    effect_u, effect_matched = (jacobian @ torch.stack([u, matched], dim=-1)).unbind(-1)
-    x_hat = x_hat + drift + effect_u - x_err * _like(x_err, config.predictor_gain)
+    step_u = u if u_bar is None else u - u_bar
+    effect_u, effect_matched = (jacobian @ torch.stack([step_u, matched], dim=-1)).unbind(-1)
+    x_hat = x_hat + change + effect_u - x_err * _like(x_err, config.predictor_gain)
 
-    finite = x_hat.sum(-1, keepdim=True).isfinite()
-    norms = torch.linalg.vector_norm(
-        torch.stack([x_err, effect_matched, estimate - effect_matched], dim=-2), dim=-1
-    )
-    norms = torch.where(finite, norms, 0.0)
-    rates = norms[..., 1:] / config.dt
+    finite = _is_finite(x_hat)
+    non_finite = ~finite
     # The least squares gives finite numbers whatever it gets, so q and sigma_m need no care.
-    next_state = L1State(
-        x_hat=torch.where(finite, x_hat, 0.0),
+    following = L1State(
+        x_hat=x_hat.masked_fill(non_finite, 0.0),
         u_bar=state.u_bar,
         q=q,
         sigma_m=sigma_m,
         n_switch=state.n_switch,
         started=finite,
     )
-    diagnostics = L1Diagnostics(
-        switch=torch.zeros_like(finite) if restart is None else restart,
-        affinization_error=torch.zeros_like(norms[..., :1]),
-        prediction_error=norms[..., :1],
-        matched=rates[..., :1],
-        unmatched=rates[..., 1:],
-        u_a=torch.linalg.vector_norm(q, dim=-1, keepdim=True),
-        saturation=((u != unbounded) & finite).to(u.dtype).mean(-1, keepdim=True),
-        ill_conditioned=ill_conditioned,
-        non_finite=~finite,
+    terms = Terms(x_err, estimate, effect_matched, q, u != unbounded, ill_conditioned, non_finite)
+    return torch.where(finite, u, u_rl), following, terms
+
+
+def _is_finite(vector: Tensor) -> Tensor:
+    """Whether a vector's sum is finite: ``(..., d)`` to ``(..., 1)``, in half of the kernels."""
+    total = vector.sum(-1, keepdim=True)
+    return total - total == 0
+
+
+def diagnose(
+    config: L1Config,
+    terms: Terms,
+    switch: Tensor | None = None,
+    affinization_error: Tensor | None = None,
+) -> L1Diagnostics:
+    """The diagnostics of a step, with those of the switching law if they are given."""
+    x_err, estimate, effect_matched, q, cut, ill_conditioned, non_finite = terms
+    norms = torch.linalg.vector_norm(
+        torch.stack([x_err, effect_matched, estimate - effect_matched], dim=-2), dim=-1
     )
-    return torch.where(finite, u, u_rl), next_state, diagnostics
+    prediction_error, matched, unmatched = norms.masked_fill(non_finite, 0.0).split(1, dim=-1)
+    return L1Diagnostics(
+        switch=torch.zeros_like(non_finite) if switch is None else switch,
+        affinization_error=(
+            torch.zeros_like(prediction_error) if affinization_error is None else affinization_error
+        ),
+        prediction_error=prediction_error,
+        matched=matched / config.dt,
+        unmatched=unmatched / config.dt,
+        u_a=torch.linalg.vector_norm(q, dim=-1, keepdim=True),
+        saturation=(cut & ~non_finite).to(q.dtype).mean(-1, keepdim=True),
+        ill_conditioned=ill_conditioned,
+        non_finite=non_finite,
+    )
 
 
 def _check_shapes(
@@ -315,8 +387,7 @@ def solve_matched(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
         solution, ill_conditioned = _solve_one_column(jacobian, residual)
         return torch.where(solution.isfinite(), solution, 0.0), ill_conditioned
     solution, ill_conditioned = _solve_columns(jacobian, residual)
-    finite = solution.isfinite().all(-1, keepdim=True)
-    return torch.where(finite, solution, 0.0), ill_conditioned
+    return solution.masked_fill(~_is_finite(solution), 0.0), ill_conditioned
 
 
 def _solve_one_column(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
@@ -331,20 +402,20 @@ def _solve_one_column(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tenso
 def _solve_columns(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
     dtype = jacobian.dtype
     length = torch.linalg.vector_norm(jacobian, dim=-2)
-    longest = length.amax(-1, keepdim=True)
-    floor = (longest * _SMALLEST_RELATIVE_COLUMN).clamp_min(_smallest_length(dtype))
-    scale = torch.maximum(length, floor)
+    floor = length.amax(-1, keepdim=True) * _SMALLEST_RELATIVE_COLUMN
+    scale = torch.maximum(length, floor.clamp_min_(_smallest_length(dtype)))
     columns = jacobian / scale.unsqueeze(-2)
-    gram = columns.mT @ columns
-    damping = DAMPING * torch.eye(gram.shape[-1], dtype=dtype, device=gram.device)
+    products = columns.mT @ torch.cat([columns, residual.unsqueeze(-1)], -1)
+    gram, projected = products[..., :-1], products[..., -1:]
+    eye = torch.eye(gram.shape[-1], dtype=dtype, device=gram.device)
     # Both systems in one call: choosing between them by a branch would not batch.
-    factor, info = torch.linalg.cholesky_ex(torch.stack([gram, gram + damping]))
-    projected = (columns.mT @ residual.unsqueeze(-1)).expand(2, *scale.shape, 1)
+    factor, info = torch.linalg.cholesky_ex(torch.stack([gram, gram.add(eye, alpha=DAMPING)]))
+    projected = projected.expand(2, *scale.shape, 1)
     plain, damped = torch.cholesky_solve(projected, factor).squeeze(-1).unbind(0)
-    pivots = factor[0].diagonal(dim1=-2, dim2=-1).square().amin(-1, keepdim=True)
+    pivots = factor[0].diagonal(dim1=-2, dim2=-1).amin(-1, keepdim=True)
     tolerance = RANK_TOLERANCE.get(dtype, RANK_TOLERANCE[torch.float32])
-    # Written so that a pivot that is not a number is flagged.
-    well_conditioned = (pivots > tolerance) & (info[0].unsqueeze(-1) == 0) & longest.isfinite()
+    # Written so that a pivot that is not a number, as of an infinite column, is flagged.
+    well_conditioned = (pivots > tolerance**0.5) & (info[0].unsqueeze(-1) == 0)
     return torch.where(well_conditioned, plain, damped) / scale, ~well_conditioned
 
 

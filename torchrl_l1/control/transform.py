@@ -159,7 +159,6 @@ class L1Transform(Transform):
             self.key,
             owner="L1Transform",
             remedy="reset the environment first and pass on what reset or step_mdp returned",
-            diagnostics=self.diagnostics,
         )
         # The caller's tensordict keeps the policy's action: this one is a shallow copy.
         tensordict.set(self.action_key, executed)
@@ -204,7 +203,9 @@ class L1Transform(Transform):
             config.check_dimensions(layout.observation_dim, layout.action_dim)
             self.model.check_dimensions(layout.observation_dim, layout.action_dim)
             if self._step_function is None or config != self._step_config:
-                self._step_function = make_step(config, self.model, self.compile_mode)
+                self._step_function = make_step(
+                    config, self.model, self.compile_mode, self.diagnostics
+                )
                 self._step_config = config
             self._layout = layout
         return self._layout

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -70,6 +70,16 @@ class ControlAffineDynamics(EnsembleDynamics):
             self.change_normalizer.denormalize(value).reshape(observation.shape),
             (jacobian * scale).reshape(*observation.shape, m),
         )
+
+    def expansion(
+        self, observation: Tensor, u_bar: Tensor, candidate: Tensor, tested: Tensor
+    ) -> tuple[Tensor, Callable[[Tensor], tuple[Tensor, Tensor]]]:
+        """As in :class:`EnsembleDynamics`; the expansion at ``u_bar`` never fails."""
+
+        def at(moved: Tensor) -> tuple[Tensor, Tensor]:
+            return self.value_and_jacobian(observation, torch.where(moved, candidate, u_bar))
+
+        return torch.zeros_like(observation), at
 
     def taylor_remainder(self, observation: Tensor, u_bar: Tensor, action: Tensor) -> Tensor:
         """Zero ``(..., n)``: the tangent in the action is the model itself."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -189,13 +189,17 @@ class EnsembleDynamics(nn.Module):
         value, tangent = self.network.value_and_directional_derivatives(
             inputs.reshape(-1, n + m), n, n + m
         )
+        return self._in_raw_units(value, tangent, observation.shape)
+
+    def _in_raw_units(
+        self, value: Tensor, tangent: Tensor, shape: torch.Size
+    ) -> tuple[Tensor, Tensor]:
+        """Mean change and Jacobian of the elites, of ``(E, B, out)`` and ``(E, B, m, out)``."""
+        n, m = self.observation_dim, self.action_dim
         change = self.change_normalizer.denormalize(self._over_elites(value)[:, :n])
         jacobian = self._over_elites(tangent)[..., :n].transpose(-2, -1)
         scale = self.change_normalizer.std[:, None] / self.action_normalizer.std
-        return (
-            change.reshape(observation.shape),
-            (jacobian * scale).reshape(*observation.shape, m),
-        )
+        return change.reshape(shape), (jacobian * scale).reshape(*shape, m)
 
     def taylor_remainder(self, observation: Tensor, u_bar: Tensor, action: Tensor) -> Tensor:
         r"""What the tangent in the action at ``u_bar`` misses of the mean change at ``action``.
@@ -218,6 +222,35 @@ class EnsembleDynamics(nn.Module):
         )
         mean = self._over_elites(remainder)[:, : self.observation_dim]
         return (mean * self.change_normalizer.std).reshape(observation.shape)
+
+    def expansion(
+        self, observation: Tensor, u_bar: Tensor, candidate: Tensor, tested: Tensor
+    ) -> tuple[Tensor, Callable[[Tensor], tuple[Tensor, Tensor]]]:
+        """The mean change expanded in the action, at ``u_bar`` or at another action.
+
+        All that the switching law and the affinization need, from one pass through the network.
+
+        Args:
+            observation: ``(..., n)``, raw units.
+            u_bar: where the model is expanded ``(..., m)``.
+            candidate: where it is expanded instead, should the expansion at ``u_bar`` fail.
+            tested: where the expansion at ``u_bar`` is compared with the model ``(..., m)``.
+
+        Returns:
+            :meth:`taylor_remainder` of ``u_bar`` and ``tested``, and a function of a mask
+            ``(..., 1)``, true where the candidate is selected, which returns
+            :meth:`value_and_jacobian` there. Both are equal to the methods' but for rounding.
+        """
+        n, m = self.observation_dim, self.action_dim
+        actions = torch.stack([u_bar, candidate, tested])
+        inputs = self.normalize_inputs(observation.expand(3, *observation.shape), actions)
+        remainder, tangents_at = self.network.expansion(inputs.reshape(3, -1, n + m), n, n + m)
+        mean = self._over_elites(remainder)[:, :n] * self.change_normalizer.std
+
+        def at(moved: Tensor) -> tuple[Tensor, Tensor]:
+            return self._in_raw_units(*tangents_at(moved.reshape(-1)), observation.shape)
+
+        return mean.reshape(observation.shape), at
 
     def _over_elites(self, per_member: Tensor) -> Tensor:
         """Mean of ``(E, ...)`` over the elites."""
