@@ -89,7 +89,7 @@ class PolicyImprovement:
         config = self.config
         trajectories = imagine(
             self.dynamics,
-            self.policy.sample,
+            self.policy.sampler(),
             self.task.imagined_reward,
             self.starts(config.imagined_steps // config.imagined_horizon, buffer),
             config.imagined_horizon,

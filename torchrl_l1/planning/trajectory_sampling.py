@@ -11,13 +11,13 @@ from torch import Tensor
 
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.dynamics import EnsembleDynamics
-from torchrl_l1.planning.compiled_motion import compiled_predictor, resolve_compilation
-from torchrl_l1.planning.network import (
+from torchrl_l1.dynamics.network import (
     PlanningNetwork,
     Precision,
     planning_precision,
     resolve_precision,
 )
+from torchrl_l1.planning.compiled_motion import compiled_predictor, resolve_compilation
 from torchrl_l1.planning.particles import (
     Draws,
     Propagation,

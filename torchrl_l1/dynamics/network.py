@@ -12,7 +12,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from torchrl_l1.dynamics import DeterministicHead, EnsembleDynamics
+from torchrl_l1.dynamics.heads import DeterministicHead
+from torchrl_l1.dynamics.model import EnsembleDynamics
 
 Precision = Literal["auto", "float32", "bfloat16"]
 
@@ -223,7 +224,10 @@ class ForwardPass:
                 if operand is not units:
                     operand.copy_(units)
                 torch.mm(operand, weight, out=out)
-        return affine_output(self._out.float(), inputs[:, self._width :].repeat(self._copies, 1))
+        raw = self._out.float()
+        if self._width == inputs.shape[1]:
+            return raw
+        return affine_output(raw, inputs[:, self._width :].repeat(self._copies, 1))
 
 
 def affine_output(raw: Tensor, action: Tensor) -> Tensor:
