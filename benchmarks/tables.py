@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.timing import Row
+from torchrl_l1.report.page import markdown
 
 
 @dataclass(frozen=True)
@@ -37,17 +38,11 @@ class Table:
 
     def markdown(self) -> str:
         """The table with its heading, each cell as median and range."""
-        lines = [
-            f"## {self.title}",
-            "",
-            self.caption,
-            "",
-            f"| {' | '.join(self.columns.values())} |",
-            "|" + "---|" * len(self.columns),
+        cells = [
+            {heading: self._cell(row, column) for column, heading in self.columns.items()}
+            for row in self.rows
         ]
-        for row in self.rows:
-            lines.append(f"| {' | '.join(self._cell(row, column) for column in self.columns)} |")
-        return "\n".join([*lines, ""])
+        return f"## {self.title}\n\n{self.caption}\n\n{markdown(cells)}\n"
 
     def _cell(self, row: Row, column: str) -> str:
         if column not in row:

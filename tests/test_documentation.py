@@ -1,14 +1,35 @@
-"""The Python snippets of README and guide run as they stand."""
+"""What README and guide show runs as it stands, and the lists in them are those of the code."""
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import importlib.util
+import io
+import math
 import re
+import shlex
+import tomllib
+from dataclasses import fields
 from pathlib import Path
 from types import ModuleType
+from typing import get_args
 
 import pytest
+import yaml
+
+from torchrl_l1 import planning
+from torchrl_l1.algorithms import MBMF
+from torchrl_l1.campaign import EvaluationSettings, read_campaign
+from torchrl_l1.campaign.jobs import LAUNCHERS
+from torchrl_l1.campaign.plan import plan
+from torchrl_l1.cli import main
+from torchrl_l1.control import L1Config
+from torchrl_l1.envs import TASKS, gymnasium_id
+from torchrl_l1.experiment.launch import compose
+from torchrl_l1.experiment.recipes import available_campaigns, available_recipes, recipes_dir
+from torchrl_l1.experiment.run import MODES
+from torchrl_l1.experiment.settings import SCHEMAS, L1Settings
 
 ROOT = Path(__file__).parents[1]
 SNIPPETS = [
@@ -62,3 +83,231 @@ def test_relative_links_lead_somewhere() -> None:
     for page in [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("docs/studies/*.md")]:
         for target in re.findall(r"\]\((?!https?:)([^)#\s]+)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def words(text: str) -> set[str]:
+    """What stands in backticks and is a plain name."""
+    return set(re.findall(r"`\"?([A-Za-z_0-9]+)\"?`", text))
+
+
+def table(page: str, *header: str) -> dict[str, list[str]]:
+    """Rows of the table with this header, by the name in their first cell."""
+    text = (ROOT / page).read_text()
+    start = text.index("|" + "|".join(f" {name} ".replace("  ", " ") for name in header) + "|\n")
+    lines = text[start:].partition("\n\n")[0].splitlines()[2:]
+    rows = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
+    return {row[0].strip("`").partition("`")[0]: row[1:] for row in rows}
+
+
+def block(page: str, language: str, beginning: str) -> str:
+    """A fenced block, by how it begins."""
+    blocks = re.findall(rf"```{language}\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
+    (found,) = [text for text in blocks if text.startswith(beginning)]
+    return found
+
+
+def options(group: str) -> set[str]:
+    return {file.stem for file in recipes_dir().glob(f"*/{group}/*.yaml")}
+
+
+def test_recipes_page_has_every_group_and_option() -> None:
+    groups = table("docs/recipes.md", "Group", "Choices")
+    folders = {file.parent.name for file in recipes_dir().glob("*/*/*.yaml")} - {"base"}
+    assert set(groups) == folders
+    for group, (choices,) in groups.items():
+        listed = re.sub(r"\(.*?\)", "", choices.partition("; single fields")[0])
+        assert words(listed) == options(group), group
+    page = (ROOT / "docs/recipes.md").read_text()
+    assert {f"{name}_recipe" for name in SCHEMAS} <= words(page)
+    assert set(MODES) - {"auto"} <= words(page) and "`wandb.mode=auto`" in page
+
+
+def test_recipes_page_has_every_key_of_the_controller() -> None:
+    page = (ROOT / "docs/recipes.md").read_text()
+    named = {word.partition(".")[2] for word in re.findall(r"`(l1\.\w+)`", page)}
+    assert named <= set(L1Settings.__dataclass_fields__)
+
+
+def test_a_recipe_of_the_page_composes(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(block("docs/recipes.md", "yaml", "defaults:"))
+    mine = compose(str(file), ["preset=paper", "run_dir=unused"])
+    assert (mine.recipe, mine.task, mine.cem.candidates) == ("mine", "half_cheetah", 300)
+    assert mine.cem.horizon == 30 and mine.model.head == "gaussian"
+
+
+@pytest.fixture(scope="module")
+def help_texts() -> dict[str, str]:
+    """What each command says of itself."""
+
+    def text(*arguments: str) -> str:
+        with contextlib.redirect_stdout(io.StringIO()) as out, pytest.raises(SystemExit):
+            main([*arguments, "--help"])
+        return out.getvalue()
+
+    commands = re.findall(r"^    (\w+)  ", text(), re.MULTILINE)
+    return {command: text(command) for command in commands}
+
+
+PAGES = [ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("docs/studies/*.md")]
+COMMANDS = [
+    shlex.split(line, comments=True)
+    for page in PAGES
+    for block_ in re.findall(r"```console\n(.*?)```", page.read_text(), re.DOTALL)
+    for line in re.findall(r"^\$ torchrl-l1 (.*)", block_.replace("\\\n", " "), re.MULTILINE)
+]
+
+
+def test_the_table_of_commands_is_complete(help_texts: dict[str, str]) -> None:
+    rows = table("docs/recipes.md", "Command", "What it does")
+    assert {name.split()[1] for name in rows} == set(help_texts)
+
+
+def test_commands_of_the_pages_exist_with_their_options(help_texts: dict[str, str]) -> None:
+    assert len(COMMANDS) > 40
+    for command, *arguments in COMMANDS:
+        for option in (text for text in arguments if text.startswith("--")):
+            of_hydra = command == "run" and option in ("--cfg", "--info")
+            assert of_hydra or option in help_texts[command], f"{command} {option}"
+
+
+@pytest.mark.parametrize("arguments", [text for text in COMMANDS if text[0] == "run"], ids=" ".join)
+def test_recipes_and_overrides_of_the_pages_compose(arguments: list[str]) -> None:
+    recipe, *rest = arguments[1:]
+    overrides = [text for text in rest if "=" in text]
+    if "-m" not in rest:
+        compose(recipe, [*overrides, "run_dir=unused"])
+    else:
+        assert recipe in available_recipes()
+
+
+def test_campaigns_of_the_pages_exist() -> None:
+    named = {arguments[1] for arguments in COMMANDS if arguments[0] == "campaign"}
+    assert len(named) > 8 and named <= set(available_campaigns())
+
+
+def test_campaigns_page_has_every_campaign_and_counts_its_runs() -> None:
+    rows = table("docs/campaigns.md", "Campaign", "Runs", "What for")
+    counts = {
+        name: sum(math.prod(map(len, part.matrix.values())) for part in read_campaign(name).runs)
+        for name in available_campaigns()
+    }
+    assert {name: int(runs) for name, (runs, _) in rows.items()} == counts
+
+
+def test_the_file_of_the_campaigns_page_is_one(tmp_path: Path) -> None:
+    text = block("docs/campaigns.md", "yaml", "name: bandwidth")
+    file = tmp_path / "own.yaml"
+    file.write_text(text)
+    campaign = read_campaign(str(file))
+    assert len(plan(campaign, tmp_path / "out")) == 12
+    (shown,) = campaign.evaluations
+    keys = set(EvaluationSettings.keys())
+    assert set(yaml.load(text, yaml.BaseLoader)["evaluations"][0]) == keys
+    # The page says so of all but these.
+    bias = {"bias": shown.matrix["bias"]}
+    assert shown == EvaluationSettings("offset", where=shown.where, matrix=bias)
+    stages = re.search(r"stage: \[\] +# .*\[(.*)\]", text)
+    assert stages is not None and tuple(stages[1].split(", ")) == MBMF.facts.stage_names
+
+
+def test_campaigns_page_names_every_launcher() -> None:
+    page = (ROOT / "docs/campaigns.md").read_text()
+    for launcher in LAUNCHERS:
+        assert re.search(rf"`{launcher}`|--launcher {launcher}\b", page), launcher
+
+
+def test_mbmf_page_names_every_recipe_and_stage() -> None:
+    page = (ROOT / "docs/mbmf.md").read_text()
+    (stages,) = re.findall(r"--stage ([a-z_ ]+) --l1", page)
+    assert tuple(stages.split()) == MBMF.facts.stage_names
+    (listed,) = re.findall(r"one for each of the five tasks: (.*?)\.", page)
+    assert {f"mbmf/{name}" for name in words(listed)} == {
+        name for name in available_recipes() if name.startswith("mbmf/")
+    }
+
+
+def test_facts_of_the_tasks_are_those_of_the_table() -> None:
+    columns = ("inverted_pendulum", "swimmer", "hopper", "walker", "half_cheetah")
+    facts = table("docs/tasks.md", "", *(f"`{name}`" for name in columns))
+    alone = table("docs/tasks.md", "", "`cartpole`")
+    for index, name in enumerate((*columns, "cartpole")):
+        task = TASKS[name]
+        rows = (
+            {key: row[index] for key, row in facts.items()}
+            if name in columns
+            else {key: row[0] for key, row in alone.items()}
+        )
+        assert int(rows["entries $n$"]) == task.observation_dim
+        actions, bound = re.findall(r"(\d+), ±(\d+)", rows["actions $m$, bound"])[0]
+        assert int(actions) == task.action_dim
+        assert (task.action_low, task.action_high) == (-float(bound), float(bound))
+        assert int(rows["horizon (steps)"]) == task.horizon
+        time = rows.get("$dt$ (s)") or rows["integration step × steps, $dt$"].split(", ")[1]
+        assert float(time.removesuffix(" s")) == task.dt
+        assert (rows["ends early"].startswith("no")) == (not task.terminates)
+
+
+def test_tasks_page_names_every_task_and_its_gymnasium_name() -> None:
+    page = (ROOT / "docs/tasks.md").read_text()
+    assert set(TASKS) <= words(page)
+    (listed,) = re.findall(r"The names are (.*?) under `torchrl_l1/`", page, re.DOTALL)
+    names = {f"torchrl_l1/{name}" for name in re.findall(r"`([\w-]+)`", listed)}
+    assert names == {gymnasium_id(name) for name in TASKS}
+
+
+def test_planning_page_has_every_option_and_public_name() -> None:
+    page = "docs/planning.md"
+    shows = "What the spread of the particles shows"
+    rows = table(page, "`propagation`", "Member that predicts", shows)
+    assert {name.strip('"') for name in rows} == set(get_args(planning.Propagation))
+    rows = table(page, "`precision`", "")
+    assert {name.strip('"') for name in rows} == set(get_args(planning.Precision))
+    text = (ROOT / page).read_text()
+    names = text[text.index("\n## Public names") :]
+    assert set(planning.__all__) <= words(names) | {"PLAN_KEY"}
+    assert "torchrl_l1.planning.PLAN_KEY" in names
+
+
+def test_the_two_controllers_differ_where_the_page_says() -> None:
+    presets = ("`L1Config.paper(dt)` (default)", "`L1Config.reference(dt)`")
+    rows = table("docs/l1.md", "", *presets)
+    paper, reference = L1Config.paper(0.05), L1Config.reference(0.05)
+    differ = {f.name for f in fields(paper) if getattr(paper, f.name) != getattr(reference, f.name)}
+    page = (ROOT / "docs/l1.md").read_text()
+    assert len(rows) == len(differ)
+    assert {name for name in differ if f"(`{name}`" in page} == differ
+
+
+def test_launchers_of_the_recipes_page_are_the_extras() -> None:
+    rows = table("docs/recipes.md", "Extra", "Where the runs go", "Override")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for name, (_, override) in rows.items():
+        (extra,) = re.findall(r"torchrl-l1\[(\w+)\]", name)
+        assert f"hydra-{extra}-launcher" in project["optional-dependencies"][extra][0]
+        assert override.strip("`").removeprefix("hydra/launcher=") in LAUNCHERS
+
+
+def test_metrics_that_pages_name_are_logged() -> None:
+    spec = importlib.util.spec_from_file_location("docs_pages", ROOT / "docs/_pages.py")
+    pages = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(pages)
+    tables = "".join(map(pages.metrics_table, pages.METRICS.values()))
+    known = set(re.findall(r"^\| `(.*?)` \|", tables, re.MULTILINE))
+    groups = "|".join({name.partition("/")[0] for name in known if "/" in name})
+    named = {
+        name
+        for page in PAGES
+        for name in re.findall(rf"`((?:{groups})/[a-z_0-9]+)`", page.read_text())
+    }
+    assert len(named) > 3 and named <= known
+
+
+def test_readme_counts_tasks_and_algorithms() -> None:
+    numbers = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
+    folders = {name.partition("/")[0] for name in available_recipes()}
+    tasks, algorithms = numbers[len(TASKS)].capitalize(), numbers[len(folders)]
+    assert (
+        f"{tasks} tasks ([which](docs/tasks.md)), {algorithms} algorithms"
+        in (ROOT / "README.md").read_text()
+    )

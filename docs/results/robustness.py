@@ -13,6 +13,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from torchrl_l1.experiment.run_directory import write_table
+from torchrl_l1.report.evaluation_summary import summary_lines
+from torchrl_l1.report.page import markdown
+
 HERE = Path(__file__).parent
 
 
@@ -24,30 +28,15 @@ def robustness(source: Path) -> None:
         if (source / kind).exists():
             shutil.copy(source / kind, HERE / kind)
     shutil.copy(source / "evaluation.csv", HERE / "robustness_cells.csv")
-    controllers = list(dict.fromkeys(row["l1"] for row in summary))
-    keys = list(dict.fromkeys((row["policy"], row["bias"]) for row in summary))
-    rows = []
-    for policy, bias in keys:
-        cells = []
-        for controller in controllers:
-            key = (policy, bias, controller)
-            row = next(r for r in summary if (r["policy"], r["bias"], r["l1"]) == key)
-            median, low, high = (float(row[f"return_{k}"]) for k in ("median", "lowest", "highest"))
-            cells.append(f"{median:.3g} [{low:.3g}, {high:.3g}]")
-        rows.append([policy, bias, *cells])
-    names = ["L1 off" if c == "off" else f"L1 `{c}`" for c in controllers]
+    rows = summary_lines(summary, ("policy",), digits=3)
     seeds, episodes = summary[0]["training_seeds"], summary[0]["episodes_per_seed"]
     note = (
         f"Mean return: median [lowest, highest] of {seeds} training seeds, {episodes} episodes "
         "each. The action bound is 3."
     )
-    header = ["policy", "bias", *names]
-    with (HERE / "robustness.csv").open("w", newline="") as handle:
-        csv.writer(handle, lineterminator="\n").writerows([header, *rows])
-    lines = [f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
-    lines += [f"| {' | '.join(map(str, row))} |" for row in rows]
+    write_table(HERE / "robustness.csv", rows)
     figures = "![robustness](results/robustness.png)\n" + filmstrip_figure(summary)
-    text = "\n".join([*lines, "", note, "", figures])
+    text = "\n\n".join([markdown(rows), note, figures])
     (HERE / "robustness.md").write_text(text)
     print(text)
 

@@ -16,12 +16,14 @@ from torchrl_l1.algorithms import (
     ModelConfig,
     Perturbation,
 )
+from torchrl_l1.algorithms.collection import Collection
 from torchrl_l1.algorithms.mbmf_config import ClonedPolicyConfig
-from torchrl_l1.algorithms.mbmf_metrics import METRICS
 from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.envs.perturbations import ActionNoise, ObservationNoise
 from torchrl_l1.planning import ShootingConfig
+
+METRICS = MBMF.facts.metrics
 
 L1 = L1Config(0.04, epsilon=0.2, action_low=-3.0, action_high=3.0)
 
@@ -164,7 +166,7 @@ def test_only_fresh_plans_are_cloned_and_what_was_planned_not_what_acted() -> No
 def test_noise_is_in_all_stages_and_l1_around_the_planner_alone() -> None:
     perturbation = Perturbation(action_noise=0.1, observation_noise=0.2)
     algorithm = MBMF("inverted_pendulum", tiny(), L1, perturbation, horizon=10)
-    stages = vars(algorithm.real)
+    stages = {k: v for k, v in vars(algorithm).items() if isinstance(v, Collection)}
     assert len(stages) == 7
     for name, collection in stages.items():
         kinds = {type(transform) for transform in collection.env.transform}
@@ -191,7 +193,7 @@ def test_episodes_that_end_early_go_through_all_stages() -> None:
     assert all(math.isfinite(value) for metrics in results for value in metrics.values())
     # Each environment takes as many steps as a full episode has.
     assert results[-1]["real_steps"] == 40 * (2 + 4 + 1 + 4)
-    assert algorithm.real.practice.collect(0, 9)["next", "terminated"].any()
+    assert algorithm.practice.collect(0, 9)["next", "terminated"].any()
 
 
 def test_networks_are_saved_once_their_stage_has_begun() -> None:

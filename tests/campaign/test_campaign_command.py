@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import fcntl
 import json
 import os
 import random
@@ -25,9 +24,10 @@ from torchrl_l1.campaign.evaluation import evaluate_run, is_evaluated
 from torchrl_l1.campaign.jobs import sweep
 from torchrl_l1.campaign.plan import PlannedRun, plan
 from torchrl_l1.campaign.progress import overview
+from torchrl_l1.campaign.workers import TEMPORARY_FAILURE
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
+from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError, locked
 
 PENDULUM = "metrpo/inverted_pendulum"
 
@@ -180,7 +180,9 @@ def test_evaluation_sweeps_epsilon_and_alpha(campaign_file: Path) -> None:
     assert is_evaluated(this.directory, settings)
     rows = [(row["l1"], row["epsilon"], row["alpha"]) for row in table(this, "tuning")]
     assert rows == [("off", "", ""), ("paper", "0.5", "0.1"), ("paper", "2.0", "0.1")]
-    assert not is_evaluated(this.directory, replace(settings, alpha=[0.2]))
+    assert not is_evaluated(
+        this.directory, replace(settings, matrix=settings.matrix | {"alpha": [0.2]})
+    )
 
 
 def path_of(this: PlannedRun, name: str) -> Path:
@@ -204,8 +206,8 @@ def test_changed_settings_and_a_second_campaign_are_refused(
     assert "--output" in error
     assert not (output / "campaign.yaml").exists()
     main(command(campaign_file, output))
-    with (output / ".lock").open() as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with locked(output / ".lock") as ours:
+        assert ours
         assert "another campaign" in ended_badly(command(campaign_file, output), capsys)
     before = (output / "campaign.yaml").read_text()
     edit(campaign_file, name="other")
@@ -258,7 +260,7 @@ def test_run_that_lost_its_directory_says_so_to_the_workers(campaign_file: Path)
         pytest.raises(SystemExit) as exit_info,
     ):
         child.train({**this.settings(), "resume": True})
-    assert exit_info.value.code == os.EX_TEMPFAIL
+    assert exit_info.value.code == TEMPORARY_FAILURE
 
 
 def test_time_left_goes_by_real_steps(

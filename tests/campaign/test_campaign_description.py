@@ -86,7 +86,7 @@ def test_evaluations_go_to_the_runs_that_match(write: Any, tmp_path: Path) -> No
 def test_tuning_of_an_evaluation_is_a_list(text: str, values: list[float], write: Any) -> None:
     file = write(RUNS + f"evaluations: [{{name: e, epsilon: {text}}}]\n")
     (settings,) = read_campaign(file).evaluations
-    assert (settings.epsilon, settings.alpha) == (values, [])
+    assert (settings.matrix["epsilon"], settings.matrix["alpha"]) == (values, [])
 
 
 def test_a_users_recipe_is_found_beside_the_campaign(write: Any, tmp_path: Path) -> None:
@@ -232,8 +232,8 @@ def test_campaigns_of_mbmf_make_the_whole_table(tmp_path: Path) -> None:
         frozen = run.values["noise"] == "none" and run.values["l1"] == "off"
         pendulum = run.config.task == "inverted_pendulum"
         stages = ["shooting", "cloning", "fine_tuning"] if pendulum else ["shooting"]
-        assert [e.stage for e in run.evaluations] == [stages] * frozen
-        assert all(len(e.bias) == (4 if pendulum else 1) for e in run.evaluations)
+        assert [e.matrix["stage"] for e in run.evaluations] == [stages] * frozen
+        assert all(len(e.matrix["bias"]) == (4 if pendulum else 1) for e in run.evaluations)
         # 200 000 real steps, as in the paper.
         assert 190_000 < run.collected_steps(run.iterations) < 210_000
 

@@ -70,8 +70,11 @@ def test_stages_are_evaluated_where_the_campaign_says_so(
     described = load_yaml(this.directory.path / "evaluations/frozen.yaml")
     assert described["stage"] == ["shooting", "fine_tuning"]
     assert "after 80 real steps" in capsys.readouterr().out
-    assert is_evaluated(this.directory, this.evaluations[0])
-    assert not is_evaluated(this.directory, replace(this.evaluations[0], stage=["shooting"]))
+    (settings,) = this.evaluations
+    assert is_evaluated(this.directory, settings)
+    assert not is_evaluated(
+        this.directory, replace(settings, matrix=settings.matrix | {"stage": ["shooting"]})
+    )
 
 
 def test_table_that_is_older_than_stages_is_of_the_last_one(tmp_path: Path) -> None:
@@ -83,13 +86,13 @@ def test_table_that_is_older_than_stages_is_of_the_last_one(tmp_path: Path) -> N
     described = {key: value for key, value in settings.of_a_run().items() if key != "stage"}
     table.with_suffix(".yaml").write_text(dump_yaml({**described, "iterations": 0}))
     assert is_evaluated(directory, settings)
-    assert not is_evaluated(directory, EvaluationSettings("e", stage=["shooting"]))
+    assert not is_evaluated(directory, EvaluationSettings("e", matrix={"stage": ["shooting"]}))
 
 
 def test_stage_that_a_run_has_not_changes_nothing(tmp_path: Path) -> None:
     overrides = [*TINY, "outer_iterations=1", f"run_dir={tmp_path}"]
     directory = run(compose("mbmf/inverted_pendulum", overrides))
-    settings = EvaluationSettings("e", policy=["stochastic"], episodes=1).of_a_run()
+    settings = EvaluationSettings("e", matrix={"policy": ["stochastic"]}, episodes=1).of_a_run()
     before = evaluate_run(str(directory), "e", json.loads(json.dumps(settings))).read_bytes()
     with pytest.raises(ValueError, match="no stage 'fine_tuning', or not yet; there is shooting"):
         evaluate_run(str(directory), "e", {**settings, "stage": ["shooting", "fine_tuning"]})
@@ -123,7 +126,9 @@ def test_stage_that_a_run_never_reaches_is_refused_before_anything_starts(
 def test_a_planner_is_tested_once(tmp_path: Path) -> None:
     """Tables that say both kinds of policies count all the same."""
     directory = run(compose("mbmf/inverted_pendulum", [*TINY, f"run_dir={tmp_path}"]))
-    settings = EvaluationSettings("e", l1=["off"], stage=["shooting", "cloning"], episodes=1)
+    settings = EvaluationSettings(
+        "e", matrix={"l1": ["off"], "stage": ["shooting", "cloning"]}, episodes=1
+    )
     with evaluate_run(str(directory), "e", settings.of_a_run()).open() as handle:
         rows = [(row["stage"], row["policy"]) for row in csv.DictReader(handle)]
     assert rows == [
@@ -150,7 +155,7 @@ def test_steps_are_those_that_the_algorithm_counts(
     algorithm = OmegaConf.to_object(config).build()
     planned = PlannedRun({}, 0, 0, RunDirectory("unused"), config)
     counted = [result.metrics["real_steps"] for result in algorithm.iterate()]
-    random = algorithm.real.start.frames
+    random = algorithm.start.frames
     assert [planned.collected_steps(i) for i in range(planned.iterations + 1)] == [
         count - random for count in (random, *counted)
     ]

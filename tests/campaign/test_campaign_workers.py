@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -11,7 +13,14 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_l1.campaign.workers import Job, Stopped, Unfinished, Workers, available_cores
+from torchrl_l1.campaign.workers import (
+    TEMPORARY_FAILURE,
+    Job,
+    Stopped,
+    Unfinished,
+    Workers,
+    available_cores,
+)
 
 MakeJob = Callable[..., Job]
 
@@ -79,7 +88,7 @@ def test_tries_again_if_another_process_was_quicker(make_job: MakeJob, tmp_path:
     ended: list[str] = []
     # The first attempt finds that another process has the directory, which then ends at once: by
     # the time the workers look, nobody holds it any more.
-    script = f"test -e {started} || {{ touch {started}; exit {os.EX_TEMPFAIL}; }}"
+    script = f"test -e {started} || {{ touch {started}; exit {TEMPORARY_FAILURE}; }}"
     job = make_job(script, lambda: ended.append("done") or [])
     assert workers(1).work([job]) == []
     assert ended == ["done"]
@@ -127,3 +136,18 @@ def test_environment_has_one_thread(make_job: MakeJob) -> None:
     assert workers(1).work([job]) == []
     assert job.log.read_text() == "1 1\n"
     assert 1 <= available_cores() <= (os.cpu_count() or 1)
+
+
+def test_the_modules_load_without_what_windows_lacks() -> None:
+    script = """
+import os, signal, sys
+import torchrl_l1
+for module in ("fcntl", "pwd", "grp", "resource", "termios"):
+    sys.modules[module] = None
+for name in ("killpg", "EX_TEMPFAIL", "sched_getaffinity", "setsid"):
+    delattr(os, name)
+del signal.SIGKILL
+import torchrl_l1.campaign.child, torchrl_l1.campaign.command, torchrl_l1.campaign.workers
+assert torchrl_l1.campaign.workers.available_cores() >= 1
+"""
+    subprocess.run([sys.executable, "-c", script], check=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 from collections.abc import Callable
@@ -19,9 +18,9 @@ from torchrl_l1.campaign.plan import PlannedRun, plan
 from torchrl_l1.campaign.reuse import copy_run, find_reusable
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.run_directory import RunDirectory
+from torchrl_l1.experiment.run_directory import RunDirectory, locked
 from torchrl_l1.report import find_runs
-from torchrl_l1.report.variants import Study
+from torchrl_l1.report.study import Study
 
 EVALUATION = {"name": "noisy", "l1": ["off"], "noise": ["action"], "episodes": 1}
 
@@ -144,8 +143,8 @@ def test_unfinished_held_and_own_runs_are_not_taken(
 
     assert list(found().values()) == [first.directory.path]
     assert found(output=(tmp_path / "first").resolve()) == {}
-    with (first.directory.path / ".lock").open() as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with locked(first.directory.path / ".lock") as ours:
+        assert ours
         assert found() == {}
     assert found()
     config = first.directory.config_file.read_text()
@@ -188,8 +187,8 @@ def test_copy_goes_only_where_no_run_is(
     assert contents(target.parent) == {"seed_0/thesis.tex": b"years of work"}
     # What a run leaves that is killed in its first moments is no run.
     (target / "thesis.tex").rename(target / ".lock")
-    with (target / ".lock").open() as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with locked(target / ".lock") as ours:
+        assert ours
         assert find_reusable([this], output, [tmp_path]) == {}
     assert len(find_reusable([this], output, [tmp_path])) == 1
     copy_run(first.directory.path, this)

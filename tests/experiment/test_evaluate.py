@@ -9,32 +9,11 @@ import pytest
 from omegaconf import DictConfig
 
 from torchrl_l1.cli import main
-from torchrl_l1.cli.robustness import summarize, table
-from torchrl_l1.experiment.evaluate import Condition, conditions, evaluate, load_run
+from torchrl_l1.experiment.evaluate import evaluate, load_run
+from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.experiment.run import run
 
 Recipe = Callable[..., DictConfig]
-
-
-def test_conditions_vary_bias_and_gain_apart() -> None:
-    cells = conditions(["off", "paper"], ["none"], [0.0, 1.0], [1.0, 0.5], ["stochastic"])
-    disturbances = [(cell.bias, cell.gain) for cell in cells if cell.l1 == "off"]
-    assert disturbances == [(0.0, 1.0), (1.0, 1.0), (0.0, 0.5)]
-    assert len(cells) == 6
-
-
-def test_conditions_sweep_epsilon_and_alpha_but_not_without_l1() -> None:
-    sweep = ([0.1, 1.0, 0.1], [0.05, 0.35])
-    cells = conditions(
-        ["off", "paper", "slow"], ["none"], [0.0, 1.0], [1.0], ["stochastic"], *sweep
-    )
-    assert len(cells) == len(set(cells)) == 2 * (1 + 2 * 2 * 2)
-    off = [(cell.epsilon, cell.alpha) for cell in cells if cell.l1 == "off"]
-    assert off == [(None, None)] * 2
-    on = {(cell.epsilon, cell.alpha) for cell in cells if cell.l1 == "slow" and cell.bias == 1.0}
-    assert on == {(0.1, 0.05), (0.1, 0.35), (1.0, 0.05), (1.0, 0.35)}
-    only_alpha = conditions(["paper"], ["none"], [0.0], [1.0], ["stochastic"], alpha=[0.2])
-    assert [(cell.epsilon, cell.alpha) for cell in only_alpha] == [(None, 0.2)]
 
 
 def test_evaluate_sweeps_epsilon_and_alpha(
@@ -57,8 +36,9 @@ def test_evaluate_sweeps_epsilon_and_alpha(
     labels = ["off", "paper epsilon=1e-09 alpha=0.05", "paper epsilon=1e+09 alpha=0.05"]
     with (directory / "evaluation" / "summary.csv").open() as file:
         assert [row["l1"] for row in csv.DictReader(file)] == labels
-    heading = capsys.readouterr().out.split("bias")[1].splitlines()[0]
-    assert heading.split() == ["gain", *" ".join(labels).split()]
+    heading = capsys.readouterr().out.split("|\n")[0].splitlines()[-1]
+    controllers = [cell.strip() for cell in heading.strip("|").split("|")]
+    assert controllers == [f"L1 {label}" for label in labels]
 
 
 def test_evaluate_writes_table_and_plot(
@@ -80,37 +60,15 @@ def test_evaluate_writes_table_and_plot(
 def test_cells_share_their_random_numbers_and_see_their_disturbance(tiny_recipe: Recipe) -> None:
     trained = load_run(run(tiny_recipe()))
     cells = [
-        Condition("off", "none", 0.0, 1.0, "stochastic"),
-        Condition("off", "none", 0.0, 1.0, "stochastic"),
-        Condition("off", "none", 3.0, 1.0, "stochastic"),
-        Condition("off", "both", 0.0, 1.0, "deterministic"),
+        Condition("off"),
+        Condition("off"),
+        Condition("off", disturbances={"bias": 3.0}),
+        Condition("off", "both", policy="deterministic"),
     ]
     first, again, biased, noisy = (row["return_mean"] for row in evaluate(trained, cells, 4))
     assert first == again
     assert biased < first
     assert noisy not in (first, biased)
-
-
-def test_summary_is_the_median_over_training_seeds() -> None:
-    cell = {"policy": "stochastic", "noise": "none", "bias": 0.0, "gain": 1.0, "episodes": 5}
-    rows = [
-        {**cell, "l1": "off", "return_mean": value, "training_seed": seed}
-        for seed, value in enumerate([-3.0, -1.0, -100.0])
-    ]
-    (entry,) = summarize(rows)
-    assert (entry["return_median"], entry["return_lowest"]) == (-3.0, -100.0)
-    assert "3 training seeds" in table([entry])
-
-
-def test_each_panel_counts_its_own_seeds() -> None:
-    cell = {"noise": "none", "bias": 0.0, "gain": 1.0, "episodes": 5, "l1": "off"}
-    rows = [
-        {**cell, "policy": policy, "return_mean": -1.0}
-        for policy in ("stochastic", "stochastic", "deterministic")
-    ]
-    both, one = table(summarize(rows)).split("\n\n")
-    assert "stochastic" in both and "of 2 training seeds" in both
-    assert "deterministic" in one and one.count("of 1 training seed\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -124,6 +82,9 @@ def test_each_panel_counts_its_own_seeds() -> None:
         (["evaluate", "nowhere", "--epsilon", "inf"], "--epsilon must be positive and finite"),
         (["evaluate", "nowhere", "--alpha", "0.1", "1.5"], "--alpha must be above 0 and at most 1"),
         (["evaluate", "nowhere", "--alpha", "nan"], "--alpha must be above 0 and at most 1"),
+        (["evaluate", "nowhere", "--bias", "0", "inf"], "--bias must be finite, got inf"),
+        (["evaluate", "nowhere", "--gain", "weak"], "argument --gain: invalid float value"),
+        (["evaluate", "nowhere", "--policy", "greedy"], "argument --policy: invalid choice"),
         (["verify", "nowhere.npz"], "no trace file"),
         (["run", "metrpo/inverted_pendlum"], "Did you mean metrpo/inverted_pendulum"),
     ],

@@ -7,7 +7,7 @@ import pytest
 from omegaconf import DictConfig
 
 from torchrl_l1.control import L1Config, L1Transform
-from torchrl_l1.experiment.evaluate import Condition, evaluate, load_run, make_collection
+from torchrl_l1.experiment.evaluate import evaluate, load_run, make_collection
 from torchrl_l1.experiment.l1_options import (
     closest_option,
     departures,
@@ -15,6 +15,7 @@ from torchrl_l1.experiment.l1_options import (
     l1_options,
     same_controller,
 )
+from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.settings import L1Settings
 
@@ -59,7 +60,7 @@ def controller(*arguments: object) -> L1Config:
 def test_a_run_is_tested_with_the_controller_it_was_trained_with(tiny_recipe: Recipe) -> None:
     tuned = ("l1.alpha=0.2", "l1.a_s=-2", "l1.on_switch=reset", "l1.project=false")
     trained = load_run(run(tiny_recipe("l1=paper", "l1.epsilon=0.5", *tuned)))
-    cells = [Condition(l1, "none", 0.0, 1.0, "stochastic") for l1 in ("off", "paper", "slow")]
+    cells = [Condition(l1) for l1 in ("off", "paper", "slow")]
     assert [row["own_l1"] for row in evaluate(trained, cells, 2)] == [0, 1, 0]
     stricter = [replace(cell, epsilon=0.4) for cell in cells]
     assert [row["own_l1"] for row in evaluate(trained, stricter, 2)] == [0, 0, 0]
@@ -73,7 +74,7 @@ def test_a_run_is_tested_with_the_controller_it_was_trained_with(tiny_recipe: Re
 def test_values_that_a_test_sets_take_the_place_of_the_runs_own(tiny_recipe: Recipe) -> None:
     # 2.5 rad/s at 0.04 s make a gain of 0.1.
     trained = load_run(run(tiny_recipe("l1=paper", "l1.epsilon=0.5", "l1.cutoff=2.5", "l1.a_s=-2")))
-    cell = Condition("slow", "none", 0.0, 1.0, "stochastic")
+    cell = Condition("slow")
     # The option that it is closest to is slow, whose gain it has.
     tests = [
         (cell, 1, 0.5, 0.1, -2.0),

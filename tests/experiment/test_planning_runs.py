@@ -11,13 +11,16 @@ import pytest
 import torch
 from omegaconf import DictConfig
 
-from torchrl_l1.algorithms.pets import METRICS
+from torchrl_l1.algorithms import PETS
 from torchrl_l1.campaign.description import dump_yaml, read_campaign
 from torchrl_l1.campaign.plan import plan
 from torchrl_l1.cli import main
-from torchrl_l1.experiment.evaluate import conditions, evaluate, load_run
+from torchrl_l1.experiment.evaluate import evaluate, load_run
 from torchrl_l1.experiment.launch import compose
+from torchrl_l1.experiment.matrix import conditions
 from torchrl_l1.experiment.run import run
+
+METRICS = PETS.facts.metrics
 
 TINY = [
     "outer_iterations=2",
@@ -99,7 +102,7 @@ def test_frozen_planner_is_evaluated_under_disturbances(
 
 def test_bias_acts_after_the_planner(make: Make) -> None:
     trained = load_run(run(make("l1=off")))
-    cells = conditions(["off"], ["none"], [0.0, 2.9], [1.0], ["stochastic"])
+    cells = conditions(l1=["off"], bias=[0.0, 2.9], policy=["stochastic"])
     first, second = evaluate(trained, cells, episodes=2)
     assert first["return_mean"] != second["return_mean"]
     again = next(evaluate(trained, cells, episodes=2))

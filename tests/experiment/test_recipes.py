@@ -177,3 +177,21 @@ def test_a_users_own_recipe_finds_the_groups_of_its_algorithm(tmp_path: Path) ->
     recipe = composed(str(own))
     assert isinstance(recipe, PETSRecipe)
     assert (recipe.particles, recipe.cem.candidates) == (7, 500)
+
+
+def test_a_users_own_recipe_may_include_a_shipped_one(tmp_path: Path) -> None:
+    own = tmp_path / "half_cheetah.yaml"  # the name of the recipe that it includes
+    own.write_text(
+        "defaults: [/dets/half_cheetah@_global_, _self_]\n"
+        "recipe: mine\nparticles: 7\nfit: {batch_size: 64}\n"
+    )
+    recipe = composed(str(own))
+    assert isinstance(recipe, PETSRecipe)
+    assert (recipe.recipe, recipe.task, recipe.particles) == ("mine", "half_cheetah", 7)
+    assert (recipe.model.head, recipe.l1.enabled) == ("deterministic", True)
+    # The presets are those of what is included, and this file has the last word.
+    recipe = composed(str(own), "preset=paper", "l1=off")
+    assert isinstance(recipe, PETSRecipe)
+    assert recipe.fit.weight_decay[-1] == 2e-4
+    assert (recipe.fit.batch_size, recipe.particles, recipe.cem.horizon) == (64, 7, 30)
+    assert not recipe.l1.enabled

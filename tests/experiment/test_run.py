@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -17,9 +18,11 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 import torchrl_l1
-from torchrl_l1.algorithms.metrpo_metrics import METRICS
+from torchrl_l1.algorithms import METRPO
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError, save_atomically
+
+METRICS = METRPO.facts.metrics
 
 Recipe = Callable[..., DictConfig]
 
@@ -59,7 +62,10 @@ def test_run_directory_has_what_is_promised(tiny_recipe: Recipe) -> None:
     assert versions["torchrl-l1"] == torchrl_l1.__version__
     for name in ("model.pt", "policy.pt", "checkpoint.pt"):
         assert torch.load(directory / name, weights_only=True)
-    assert not list(directory.glob("*.tmp"))
+    page = (Path(__file__).parents[2] / "docs/recipes.md").read_text()
+    (promised,) = re.findall(r"```text\nRUN_DIR/\n(.*?)```", page, re.DOTALL)
+    names = set(re.findall(r"\b\w+\.(?:yaml|json|csv|pt)\b", promised))
+    assert {file.name for file in directory.iterdir()} == names | {".lock"}
 
 
 def test_finished_run_is_left_alone_and_found_complete(

@@ -12,13 +12,18 @@ import matplotlib.image
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_l1.algorithms import MBMF
+from torchrl_l1.algorithms.facts import KINDS
+from torchrl_l1.algorithms.policy import kinds_of
 from torchrl_l1.cli import evaluate as evaluate_command
 from torchrl_l1.cli import main
-from torchrl_l1.experiment.evaluate import Condition, TrainedRun, evaluate, load_run
+from torchrl_l1.experiment.evaluate import TrainedRun, evaluate, load_run
 from torchrl_l1.experiment.launch import compose
+from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.settings import SCHEMAS
-from torchrl_l1.experiment.stages import KINDS, STAGES, kinds_of
+
+MBMF_STAGES = MBMF.facts.stage_names
 
 TINY = [
     *("outer_iterations=3", "shooting_iterations=1", "cloning.iterations=1", "horizon=8"),
@@ -54,11 +59,13 @@ def rows_of(file: Path) -> list[dict[str, str]]:
 
 
 def test_stages_of_each_algorithm_are_known(trained: Path) -> None:
-    assert set(STAGES) == set(SCHEMAS)
     for name in ("metrpo", "pets"):
         config = compose(f"{name}/inverted_pendulum", ["run_dir=unused", "model.hidden=[8]"])
-        assert tuple(OmegaConf.to_object(config).build().policies) == STAGES[name]
-    assert tuple(load_run(trained).algorithm.policies) == STAGES["mbmf"]
+        assert (
+            tuple(OmegaConf.to_object(config).build().policies)
+            == SCHEMAS[name].builds.facts.stage_names
+        )
+    assert tuple(load_run(trained).algorithm.policies) == MBMF_STAGES
 
 
 @pytest.mark.parametrize("iterations", range(1, 7))
@@ -84,7 +91,7 @@ def test_each_stage_is_evaluated_on_its_own(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["evaluate", str(trained), "--l1", "off", "paper", "--bias", "0", "1"]
-    main([*command, "--episodes", "2", "--output", str(tmp_path), "--stage", *STAGES["mbmf"]])
+    main([*command, "--episodes", "2", "--output", str(tmp_path), "--stage", *MBMF_STAGES])
     rows = rows_of(tmp_path / "evaluation.csv")
     cells = {(row["stage"], row["policy"]) for row in rows}
     # The planner's sampled and mean actions would say the same twice.
@@ -105,7 +112,7 @@ def test_each_stage_is_evaluated_on_its_own(
 def test_last_stage_is_the_default_and_is_named(trained: Path) -> None:
     loaded = load_run(trained)
     default, named, other = (
-        next(evaluate(loaded, [Condition("off", "none", 0.0, 1.0, "stochastic", stage=name)], 2))
+        next(evaluate(loaded, [Condition("off", stage=name)], 2))
         for name in (None, "fine_tuning", "cloning")
     )
     assert default["stage"] == named["stage"] == "fine_tuning"
@@ -129,7 +136,7 @@ def test_stage_not_reached_is_refused_before_any_work(
 def test_runs_that_are_differently_far_need_the_name_of_the_stage(tmp_path: Path) -> None:
     runs = [
         TrainedRun(tmp_path / name, None, SimpleNamespace(policies=dict.fromkeys(stages)))
-        for name, stages in {"one": STAGES["mbmf"][:1], "two": STAGES["mbmf"][:2]}.items()
+        for name, stages in {"one": MBMF_STAGES[:1], "two": MBMF_STAGES[:2]}.items()
     ]
     with pytest.raises(ValueError, match=r"one has reached the stage shooting and .*two cloning"):
         evaluate_command._stages(runs, [])
@@ -162,7 +169,7 @@ def test_runs_with_compiled_plans_are_evaluated_without(tmp_path: Path) -> None:
 
 def test_rows_of_a_single_stage_are_as_they_were(tiny_recipe: Callable[..., DictConfig]) -> None:
     loaded = load_run(run(tiny_recipe("outer_iterations=1")))
-    cell = Condition("off", "none", 0.0, 1.0, "stochastic")
+    cell = Condition("off")
     (row,) = evaluate(loaded, [cell], 2)
     assert "stage" not in row
     with pytest.raises(ValueError, match="no stage 'shooting', or not yet; there is policy"):

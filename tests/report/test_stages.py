@@ -14,16 +14,15 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.stats import t
 
+from torchrl_l1.algorithms import MBMF
 from torchrl_l1.experiment.run_directory import RunDirectoryError
-from torchrl_l1.experiment.stages import STAGES as ALL_STAGES
-from torchrl_l1.report import curve_panels, evaluation_figures, report
-from torchrl_l1.report.evaluation_tables import evaluation_rows
-from torchrl_l1.report.finding import find_readable_runs, find_runs
-from torchrl_l1.report.learning_curves import plot_stages, plot_task
-from torchrl_l1.report.stage_tables import stage_rows
-from torchrl_l1.report.time_tables import time_rows, time_table
-from torchrl_l1.report.training_tables import training_row
-from torchrl_l1.report.variants import Study, studies
+from torchrl_l1.report import curves, evaluation_figures, report
+from torchrl_l1.report.curves import plot_task
+from torchrl_l1.report.evaluations import evaluation_rows
+from torchrl_l1.report.runs import find_readable_runs, find_runs
+from torchrl_l1.report.stages import plot_stages, stage_rows
+from torchrl_l1.report.study import Study, studies
+from torchrl_l1.report.training import time_rows, time_table, training_row
 
 WriteRun = Callable[..., Path]
 
@@ -179,7 +178,7 @@ def test_missing_stage_is_named(write_run: WriteRun, tmp_path: Path) -> None:
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, Figure]:
     figures: dict[str, Figure] = {}
-    for module in (curve_panels, evaluation_figures):
+    for module in (curves, evaluation_figures):
         save = module.save
         monkeypatch.setattr(
             module,
@@ -318,7 +317,7 @@ def test_ablation_tells_planners_from_policies(write_mbmf: WriteRun, tmp_path: P
     section = page.split("\n## Ablation\n")[1].split("\n## ")[0]
     tables = re.findall(r"^L1 paper(.*):\n\n((?:\|.*\n)+)", section, re.MULTILINE)
     found = [
-        (words, [name for name in ALL_STAGES["mbmf"] if f"| {name} |" in text])
+        (words, [name for name in MBMF.facts.stage_names if f"| {name} |" in text])
         for words, text in tables
     ]
     assert found == [

@@ -1,5 +1,6 @@
 """Model-based reinforcement learning algorithms, one readable loop each."""
 
+from torchrl_l1.algorithms.algorithm import Algorithm
 from torchrl_l1.algorithms.config import ModelConfig
 from torchrl_l1.algorithms.mbmf import MBMF
 from torchrl_l1.algorithms.mbmf_config import (
@@ -18,6 +19,7 @@ __all__ = [
     "MBMF",
     "METRPO",
     "PETS",
+    "Algorithm",
     "ClonedPolicyConfig",
     "CloningConfig",
     "FineTuningConfig",

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
-import hashlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import partial
+from time import perf_counter
+from typing import Any, ClassVar, Protocol, TypedDict
 
 import torch
 from tensordict.nn import TensorDictModuleBase
 
-from torchrl_l1.dynamics import EnsembleDynamics
-from torchrl_l1.envs import Task
+from torchrl_l1.algorithms.collection import RETURN_METRICS, Collection
+from torchrl_l1.algorithms.config import ModelConfig, episode_length
+from torchrl_l1.algorithms.facts import AlgorithmFacts
+from torchrl_l1.algorithms.model_learning import FIT_METRICS, ModelLearning, fit_metrics
+from torchrl_l1.algorithms.seeding import seed_streams
+from torchrl_l1.compilation import CompileMode
+from torchrl_l1.control import L1Config
+from torchrl_l1.dynamics import FitConfig, make_dynamics
+from torchrl_l1.dynamics.network import model_precision
+from torchrl_l1.envs import Perturbation, get_task
 
 DEVICES = ("cpu", "cuda", "auto")
 """Where models may be fitted and trajectories imagined."""
@@ -29,22 +41,13 @@ def resolve_device(name: str) -> torch.device:
     return device
 
 
-def stream_seed(seed: int, *names: str | int) -> int:
-    """A 63-bit seed for the stream of that name.
-
-    Examples:
-        >>> stream_seed(0, "iteration", 3) == stream_seed(0, "iteration", 3)
-        True
-        >>> stream_seed(0, "iteration", 3) == stream_seed(0, "iteration", 4)
-        False
-    """
-    digest = hashlib.sha256(repr((seed, *names)).encode()).digest()
-    return int.from_bytes(digest[:8], "big") >> 1
-
-
-def seed_streams(seed: int, *names: str | int) -> None:
-    """Start torch's global generator on the stream of that name."""
-    torch.manual_seed(stream_seed(seed, *names))
+COMMON_METRICS: dict[str, str] = {
+    "iteration": "Outer iteration, from 0.",
+    "real_steps": "Real environment steps so far, the initial random ones included.",
+    **RETURN_METRICS,
+    **FIT_METRICS,
+}
+"""What every algorithm logs."""
 
 
 @dataclass
@@ -55,46 +58,161 @@ class IterationResult:
     seconds: dict[str, float]
 
 
-class Algorithm(Protocol):
-    """A model-based algorithm and its state.
+class AlgorithmConfig(Protocol):
+    """What the settings of all algorithms have in common."""
+
+    outer_iterations: int
+    episode_steps: int | None
+    label: str
+    model: ModelConfig
+    fit: FitConfig
+
+
+class Surroundings(TypedDict, total=False):
+    """What an algorithm takes beside its settings, see :class:`Algorithm`."""
+
+    seed: int
+    horizon: int | None
+    device: str
+    compile_l1: CompileMode
+    on_phase: Callable[[str], None] | None
+
+
+class Algorithm(ABC):
+    """What model-based algorithms share: task, model, data, random streams, phases, state.
+
+    A loop goes over :meth:`rounds`, does its work in :meth:`phase` after phase, and yields the
+    :meth:`result` of each round.
+
+    Args:
+        task: name of a task, see :data:`torchrl_l1.envs.TASKS`.
+        config: settings.
+        l1: the adaptive controller of real environments; ``None`` for none.
+        perturbation: noise and disturbances of the real environments.
+        seed: seed of every random stream. Streams are derived anew from the seed and the
+            iteration's number, so that a resumed run draws what an unbroken one would have.
+        horizon: steps per full real episode; the task's own by default.
+        device: where models are fitted, trajectories imagined and plans made: ``cpu``, ``cuda`` or
+            ``auto``. Real environments, and copies of what acts in them, are on the CPU.
+        compile_l1: whether to compile the controller's step, see
+            :class:`~torchrl_l1.control.L1Transform`.
+        on_phase: called with a word on what is going on, for progress bars.
 
     Attributes:
+        facts: what is known of the algorithm without running it.
+        config_class: the class of its settings.
         iteration: outer iterations that are complete.
-        task: what it learns.
+        dynamics: the model.
         acting_dynamics: the model that L1 uses in real environments, on the CPU.
-        on_phase: called with a word on what is going on, for progress bars.
+        learning: the model's data and fits; a subclass says how many there will be.
+        real: makes real environments, see :class:`~torchrl_l1.algorithms.collection.Collection`.
+        horizon: steps per full real episode.
+        episode_steps: steps of a collected one.
     """
 
-    iteration: int
-    task: Task
-    acting_dynamics: EnsembleDynamics
-    on_phase: Callable[[str], None]
+    facts: ClassVar[AlgorithmFacts]
+    config_class: ClassVar[type[Any]]
+    config: AlgorithmConfig
+    learning: ModelLearning
+
+    def __init__(
+        self,
+        task: str,
+        config: AlgorithmConfig,
+        l1: L1Config | None = None,
+        perturbation: Perturbation | None = None,
+        *,
+        seed: int = 0,
+        horizon: int | None = None,
+        device: str = "cpu",
+        compile_l1: CompileMode = False,
+        on_phase: Callable[[str], None] | None = None,
+    ) -> None:
+        self.config, self.seed = config, seed
+        self.device = resolve_device(device)
+        self.on_phase = on_phase or (lambda phase: None)
+        self.task = get_task(task)
+        self.horizon = horizon or self.task.horizon
+        self.episode_steps = episode_length(config.episode_steps, self.horizon)
+        self.iteration = 0
+        self._seconds: dict[str, float] = {}
+
+        seed_streams(self.seed, "initialisation")
+        model = vars(config.model)
+        self.dynamics = make_dynamics(self.task.observation_dim, self.task.action_dim, **model)
+        self.dynamics.to(self.device)
+        on_cpu = self.device.type == "cpu"
+        self.acting_dynamics = self.dynamics if on_cpu else deepcopy(self.dynamics).cpu()
+        self.real = partial(
+            Collection,
+            self.task,
+            dynamics=self.acting_dynamics,
+            l1=l1,
+            perturbation=perturbation or Perturbation(),
+            compile_l1=compile_l1,
+        )
+
+    @abstractmethod
+    def iterate(self) -> Iterator[IterationResult]:
+        """Run the outer iterations that are left, reporting after each."""
 
     @property
+    @abstractmethod
     def policies(self) -> Mapping[str, TensorDictModuleBase]:
         """What acts in real environments, by the names of the stages that they come from.
 
         In the order in which they come about, and only what has been learned so far; the last one
         is the algorithm's result.
         """
-        ...
 
-    def iterate(self) -> Iterator[IterationResult]:
-        """Run the outer iterations that are left, reporting after each."""
-        ...
+    def rounds(self) -> Iterator[int]:
+        """The outer iterations that are left, each on random streams and a clock of its own."""
+        while self.iteration < self.config.outer_iterations:
+            seed_streams(self.seed, "iteration", self.iteration)
+            self._seconds = dict.fromkeys(self.facts.phases, 0.0)
+            yield self.iteration
 
-    def choices(self) -> Mapping[str, str]:
+    @contextmanager
+    def phase(self, name: str, words: str = "") -> Iterator[None]:
+        """Measure a phase of an outer iteration, and say that it has begun.
+
+        Args:
+            name: one of ``facts.phases``.
+            words: on what is going on; those of the phase by default.
+        """
+        self.on_phase(words or self.facts.phases[name])
+        start = perf_counter()
+        yield
+        self._seconds[name] += perf_counter() - start
+
+    def fit(self) -> dict[str, float]:
+        """The phase in which the model is fitted to all real data; returns its metrics."""
+        with self.phase("fit"):
+            report = self.learning.fit(lambda epoch: self.on_phase(f"fit, epoch {epoch}"))
+            self.acting_dynamics.load_state_dict(self.dynamics.state_dict())
+        return fit_metrics(report)
+
+    def result(self, real_steps: int, metrics: Mapping[str, float]) -> IterationResult:
+        """End the outer iteration after so many real steps in all."""
+        head = {"iteration": self.iteration, "real_steps": real_steps}
+        self.iteration += 1
+        return IterationResult({**head, **metrics}, self._seconds)
+
+    def choices(self) -> dict[str, str]:
         """What settings that say ``auto`` have become on this machine."""
-        ...
+        fit = model_precision(self.dynamics, self.config.fit.precision)
+        return {"device": str(self.device), "fit": fit}
 
-    def weights(self) -> Mapping[str, dict[str, Any]]:
+    def weights(self) -> dict[str, dict[str, Any]]:
         """State dicts of what has been learned, by the names under which users look for them."""
-        ...
+        return {"model": self.dynamics.state_dict()}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue, as plain tensors and numbers."""
-        ...
+        return {"iteration": self.iteration, **self.learning.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        ...
+        self.iteration = state["iteration"]
+        self.learning.load_state_dict(state)
+        self.acting_dynamics.load_state_dict(self.dynamics.state_dict())

@@ -15,6 +15,16 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl_l1.algorithms.mbmf_config import CloningConfig
 from torchrl_l1.algorithms.policy import GaussianPolicy
 
+CLONING_METRICS: dict[str, str] = {
+    "clone/train_loss": "Stage 2: mean squared difference between the policy's and the planner's "
+    "actions in the last epoch, in halves of the action range.",
+    "clone/validation_loss": "Stage 2: the same on the states kept out of training, for the "
+    "weights kept. Random shooting is noisy: what its actions scatter is left here.",
+    "clone/epochs": "Stage 2: passes over the labelled states.",
+    "clone/states": "Stage 2: labelled states so far.",
+}
+"""What a round of cloning reports."""
+
 
 @dataclass
 class CloningReport:
@@ -29,6 +39,15 @@ class CloningReport:
     train_loss: float
     validation_loss: float
     epochs: int
+
+    def metrics(self, states: int) -> dict[str, float]:
+        """Metrics of a round on so many labelled states."""
+        return {
+            "clone/train_loss": self.train_loss,
+            "clone/validation_loss": self.validation_loss,
+            "clone/epochs": self.epochs,
+            "clone/states": states,
+        }
 
 
 class Cloning:

@@ -14,11 +14,43 @@ from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase, RewardSum, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_type
 
-from torchrl_l1.algorithms.algorithm import seed_streams, stream_seed
+from torchrl_l1.algorithms.seeding import seed_streams, stream_seed
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.envs import Perturbation, Task, make_env
+
+RETURN_METRICS: dict[str, str] = {
+    "return_mean": "Mean return of full real episodes, with L1 if it is on.",
+    "return_std": "Standard deviation over these episodes.",
+    "return_min": "Lowest return among them.",
+    "return_max": "Highest return among them.",
+    "return_deterministic": "Mean return of full real episodes with mean actions.",
+    "episodes": "Number of episodes behind `return_mean`.",
+    "non_finite_steps": "Real steps on which the simulator's state became non-finite; they end "
+    "the episode and are kept out of the data.",
+}
+"""What the episodes of a round show, whatever collected them."""
+
+L1_METRICS: dict[str, str] = {
+    "l1/switch_rate": "Switches of the operating point per real step.",
+    "l1/affinization_error": "Mean distance between model and affine model at the tested input, "
+    "raw state units, before switching.",
+    "l1/affinization_error_max": "Largest such distance.",
+    "l1/prediction_error": "Mean norm of the predictor's error x_hat - x, raw state units.",
+    "l1/prediction_error_max": "Largest such norm.",
+    "l1/matched": "Mean norm of the matched part of the estimate, state units per second.",
+    "l1/matched_max": "Largest such norm.",
+    "l1/unmatched": "Mean norm of the unmatched estimate, state units per second. It is "
+    "estimated, not cancelled.",
+    "l1/unmatched_max": "Largest such norm.",
+    "l1/u_a": "Mean norm of the adaptive input, action units.",
+    "l1/u_a_max": "Largest such norm.",
+    "l1/saturation": "Share of action entries that a bound cut.",
+    "l1/ill_conditioned": "Share of steps with a rank-deficient or ill-conditioned Jacobian.",
+    "l1/non_finite": "Steps on which an input of L1 was not finite and it stood aside.",
+}
+"""What the adaptive controller did in them; only with L1 on."""
 
 _L1_MEANS = {
     "switch": "switch_rate",
@@ -47,10 +79,7 @@ def make_pipeline(
     return make_env(
         task,
         num_envs,
-        action_noise=perturbation.action_noise,
-        observation_noise=perturbation.observation_noise,
-        actuator_bias=perturbation.actuator_bias,
-        actuator_gain=perturbation.actuator_gain,
+        **vars(perturbation),
         max_steps=horizon,
         extra_transforms=[RewardSum(), *controller, *extra],
     )
@@ -160,6 +189,12 @@ def return_metrics(data: TensorDictBase) -> dict[str, float]:
         "return_max": returns.max().item(),
         "episodes": returns.numel(),
     }
+
+
+def returns_of_one_way(data: TensorDictBase) -> dict[str, float]:
+    """Returns of what acts the same with sampled and with mean actions."""
+    deterministic = episode_returns(data).mean().item()
+    return {**return_metrics(data), "return_deterministic": deterministic}
 
 
 def policy_returns(

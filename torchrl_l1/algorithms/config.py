@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, get_args
+from typing import Any, Protocol, get_args
 
-from torchrl_l1.dynamics import HEADS, MODEL_FORMS
+from torchrl_l1.dynamics import HEADS, MODEL_FORMS, EnsembleDynamics
 from torchrl_l1.dynamics.ensemble import ActivationName
-from torchrl_l1.planning import check_sampling, resolve_compilation
+from torchrl_l1.envs import Task
+from torchrl_l1.planning import TrajectorySampler, check_sampling, resolve_compilation
 
 
 class PlanSettings(Protocol):
@@ -20,6 +21,29 @@ class PlanSettings(Protocol):
     precision: str
     compile_plans: bool | str
     replan_every: int
+
+
+def make_sampler(
+    settings: PlanSettings, dynamics: EnsembleDynamics, task: Task, **more: Any
+) -> TrajectorySampler:
+    """What values plans on a task, as an algorithm's settings say.
+
+    Args:
+        settings: those of the algorithm.
+        dynamics: the model.
+        task: for reward and termination.
+        **more: what only some algorithms set of :class:`~torchrl_l1.planning.TrajectorySampler`.
+    """
+    return TrajectorySampler(
+        dynamics,
+        task.imagined_reward,
+        task.terminated if task.terminates else None,
+        settings.particles,
+        settings.propagation,  # type: ignore[arg-type]
+        settings.precision,  # type: ignore[arg-type]
+        compile=settings.compile_plans,  # type: ignore[arg-type]
+        **more,
+    )
 
 
 def check_plans(settings: PlanSettings, optimizer: str, horizon: int) -> None:
@@ -39,6 +63,16 @@ def check_plans(settings: PlanSettings, optimizer: str, horizon: int) -> None:
     resolve_compilation(
         settings.compile_plans, propagation=settings.propagation, name="compile_plans"
     )
+
+
+def episode_length(asked: int | None, horizon: int) -> int:
+    """Steps of an episode: those asked for, and no more than a full one has.
+
+    Examples:
+        >>> episode_length(None, 100), episode_length(30, 100), episode_length(300, 100)
+        (100, 30, 100)
+    """
+    return min(asked or horizon, horizon)
 
 
 def check_counts(settings: object, *names: str, prefix: str = "") -> None:

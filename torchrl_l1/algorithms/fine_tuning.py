@@ -21,6 +21,16 @@ from torchrl_l1.envs import Task
 _SAMPLED = "sampled"
 _LOG_PROB = "sampled_log_prob"
 
+FINE_TUNING_METRICS: dict[str, str] = {
+    "ppo/kl": "Stage 3: estimate of the KL divergence from the policy that collected, the mean "
+    "difference of log-densities, last pass, nats. It may be slightly negative.",
+    "ppo/clip_fraction": "Stage 3: share of likelihood ratios beyond the bound, last pass.",
+    "ppo/value_loss": "Stage 3: squared error of the value network, last pass.",
+    "ppo/explained_variance": "Stage 3: share of the variance of the value targets that the "
+    "network explains, last pass.",
+}
+"""What a round of fine-tuning reports."""
+
 
 @dataclass
 class FineTuningReport:
@@ -37,6 +47,15 @@ class FineTuningReport:
     clip_fraction: float
     value_loss: float
     explained_variance: float
+
+    def metrics(self) -> dict[str, float]:
+        """Metrics of a round."""
+        return {
+            "ppo/kl": self.kl,
+            "ppo/clip_fraction": self.clip_fraction,
+            "ppo/value_loss": self.value_loss,
+            "ppo/explained_variance": self.explained_variance,
+        }
 
 
 class FineTuning:

@@ -9,59 +9,93 @@ in the first stage (arXiv 2403.14860, section "L1-MBMF"); the other two do not k
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
 from copy import deepcopy
 from dataclasses import replace
-from time import perf_counter
-from typing import Any
+from functools import partial
+from typing import Any, Unpack
 
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_l1.algorithms.algorithm import IterationResult, resolve_device, seed_streams
-from torchrl_l1.algorithms.cloning import Cloning
+from torchrl_l1.algorithms.algorithm import (
+    COMMON_METRICS,
+    Algorithm,
+    IterationResult,
+    Surroundings,
+)
+from torchrl_l1.algorithms.cloning import CLONING_METRICS, Cloning
 from torchrl_l1.algorithms.collection import (
-    episode_returns,
+    L1_METRICS,
     policy_returns,
-    return_metrics,
+    returns_of_one_way,
     signal_metrics,
 )
-from torchrl_l1.algorithms.fine_tuning import FineTuning
-from torchrl_l1.algorithms.mbmf_config import MBMFConfig
-from torchrl_l1.algorithms.mbmf_environments import StageEnvironments
-from torchrl_l1.algorithms.mbmf_metrics import STAGES, cloning_metrics, fine_tuning_metrics
-from torchrl_l1.algorithms.metrics import fit_metrics
+from torchrl_l1.algorithms.config import episode_length, make_sampler
+from torchrl_l1.algorithms.facts import AlgorithmFacts
+from torchrl_l1.algorithms.fine_tuning import FINE_TUNING_METRICS, FineTuning, exploring
+from torchrl_l1.algorithms.mbmf_config import STAGES, MBMFConfig
 from torchrl_l1.algorithms.model_learning import ModelLearning
-from torchrl_l1.algorithms.policy import GaussianPolicy
-from torchrl_l1.compilation import CompileMode
+from torchrl_l1.algorithms.policy import GaussianPolicy, acting
 from torchrl_l1.control import L1Config
-from torchrl_l1.dynamics import make_dynamics
-from torchrl_l1.envs import Perturbation, get_task
-from torchrl_l1.planning import ModelPredictiveController, ShootingConfig, TrajectorySampler
-
-_PHASES = ("random", "fit", "clone", "tune", "collect", "evaluate")
+from torchrl_l1.envs import Perturbation
+from torchrl_l1.planning import ModelPredictiveController, ShootingConfig
 
 
-class MBMF:
+class MBMF(Algorithm):
     """The algorithm and its state; :meth:`iterate` is the loop.
 
     Args:
         task: name of a task, see :data:`torchrl_l1.envs.TASKS`.
         config: settings.
         l1: the adaptive controller around the planner; ``None`` for none.
-        perturbation: noise and disturbances of the real environment, in all stages.
-        seed: seed of every random stream. Streams are derived anew from the seed and the
-            iteration's number, so that a resumed run draws what an unbroken one would have.
-        horizon: steps per real episode; the task's own by default.
-        device: where models are fitted and plans are made: ``cpu``, ``cuda`` or ``auto``. Real
-            environments, the copy of the model that L1 uses in them, and the policy, which is
-            small, are on the CPU.
-        compile_l1: whether to compile the controller's step, see
-            :class:`~torchrl_l1.control.L1Transform`.
-        on_phase: called with a word on what is going on, for progress bars.
+        perturbation: noise and disturbances of the real environments.
+        **surroundings: see :class:`~torchrl_l1.algorithms.Algorithm`.
+
+    Attributes:
+        start: random data.
+        shooting: episodes of the planner that join the data.
+        shooting_measured: full ones beside them.
+        visits: episodes of the policy whose states are labelled.
+        clone_measured: full episodes of the clone.
+        practice: episodes that PPO learns from.
+        policy_measured: full ones beside them.
     """
+
+    config_class = MBMFConfig
+    config: MBMFConfig
+    facts = AlgorithmFacts(
+        name="MBMF",
+        stages=STAGES,
+        phases={
+            "random": "random data",
+            "fit": "fit",
+            "clone": "cloning",
+            "tune": "PPO",
+            "collect": "collecting",
+            "evaluate": "evaluating",
+        },
+        metrics={
+            **COMMON_METRICS,
+            "stage": "Stage of the iteration: 1 random shooting, 2 cloning (DAgger), "
+            "3 fine-tuning (PPO).",
+            "return_mean": "Mean return of full real episodes. Stage 1: of the planner, with L1 if "
+            "it is on; they join the data, unless `episode_steps` makes those shorter. Stage 2: of "
+            "the cloned policy's mean action, without L1, on `evaluation_episodes` episodes beside "
+            "the data. Stage 3: of sampled actions, without L1, in the episodes that PPO learns "
+            "from, or in `evaluation_episodes` beside them if those are shorter or ended early.",
+            "return_deterministic": "The same in stages 1 and 2; in stage 3 of the policy's mean "
+            "action, on `evaluation_episodes` episodes beside the data.",
+            "plan/promised_return": "Stages 1 and 2: mean imagined return of the best sequence of "
+            "each plan, over collected steps or over the states that the planner labels.",
+            **CLONING_METRICS,
+            **FINE_TUNING_METRICS,
+            "policy/std": "Stage 3: mean standard deviation of the policy, action units.",
+            **L1_METRICS,
+        },
+        color="#E69F00",
+        tables={"training": "4"},
+    )
 
     def __init__(
         self,
@@ -69,21 +103,10 @@ class MBMF:
         config: MBMFConfig,
         l1: L1Config | None = None,
         perturbation: Perturbation | None = None,
-        seed: int = 0,
-        horizon: int | None = None,
-        device: str = "cpu",
-        compile_l1: CompileMode = False,
-        on_phase: Callable[[str], None] | None = None,
+        **surroundings: Unpack[Surroundings],
     ) -> None:
-        self.config, self.seed = config, seed
-        self.device = resolve_device(device)
-        self.on_phase = on_phase or (lambda phase: None)
-        self.task = get_task(task)
+        super().__init__(task, config, l1, perturbation, **surroundings)
         n, m = self.task.observation_dim, self.task.action_dim
-        seed_streams(seed, "initialisation")
-        self.dynamics = make_dynamics(n, m, **vars(config.model)).to(self.device)
-        on_cpu = self.device.type == "cpu"
-        self.acting_dynamics = self.dynamics if on_cpu else deepcopy(self.dynamics).cpu()
         self.planner = self._planner(config.shooting)
         # In a state that the policy has visited there is no previous plan; the middle of the
         # bounds must not stand for one: where doing nothing is good, it would beat every draw.
@@ -91,72 +114,64 @@ class MBMF:
         self.initial = GaussianPolicy(n, m, config.policy.hidden, config.cloning.std)
         self.clone, self.policy = deepcopy(self.initial), deepcopy(self.initial)
         self.fine_tuning = FineTuning(self.policy, config.fine_tuning)
-
-        self.real = StageEnvironments(
-            self.task,
-            config,
-            self.acting_dynamics,
-            planner=self.planner,
-            visiting=self.clone if config.cloning.label_states == "current" else self.initial,
-            clone=self.clone,
-            policy=self.policy,
-            l1=l1,
-            perturbation=perturbation or Perturbation(),
-            horizon=horizon,
-            compile_l1=compile_l1,
+        self._open_environments()
+        collected = config.collected_episodes(
+            config.shooting_iterations + config.cloning.iterations
         )
-        rounds = config.shooting_iterations + config.cloning.iterations
-        collected = config.collected_episodes(rounds) * self.real.shooting.horizon
-        capacity = self.real.start.frames + collected
+        collected *= self.episode_steps
+        capacity = self.start.frames + collected
         self.learning = ModelLearning(self.dynamics, config.fit, config.label, capacity)
         half = (self.task.action_high - self.task.action_low) / 2
         self.cloning = Cloning(self.clone, config.cloning, half, collected)
-        self.iteration = 0
+
+    def _open_environments(self) -> None:
+        """What collects and what measures in each stage; L1 is around the planner alone."""
+        config, steps = self.config, self.episode_steps
+        random_steps = episode_length(config.random_steps or steps, self.horizon)
+        planned = partial(self.real, policy=self.planner)
+        self.start = planned(episodes=config.random_episodes, horizon=random_steps)
+        self.shooting = planned(episodes=config.shooting_episodes, horizon=steps)
+        self.shooting_measured = planned(episodes=config.shooting_episodes, horizon=self.horizon)
+
+        bare = partial(self.real, l1=None)
+        measured = partial(bare, episodes=config.evaluation_episodes, horizon=self.horizon)
+        visiting = self.clone if config.cloning.label_states == "current" else self.initial
+        explorer = exploring(self.policy, self.task)
+        self.visits = bare(
+            policy=acting(visiting, self.task), episodes=config.cloning.episodes, horizon=steps
+        )
+        self.clone_measured = measured(policy=acting(self.clone, self.task))
+        self.practice = bare(policy=explorer, episodes=config.fine_tuning.episodes, horizon=steps)
+        self.policy_measured = measured(policy=explorer)
 
     def iterate(self) -> Iterator[IterationResult]:
         """Run the outer iterations that are left, of all stages, reporting after each."""
-        rounds = {"shooting": self._shoot, "cloning": self._clone, "fine_tuning": self._fine_tune}
-        while self.iteration < self.config.outer_iterations:
-            seed_streams(self.seed, "iteration", self.iteration)
-            self._seconds = dict.fromkeys(_PHASES, 0.0)
-            name, number = self.stage(self.iteration)
-            metrics = rounds[name](number)
-            head = {
-                "iteration": self.iteration,
-                "real_steps": self.real.start.frames
-                + self.config.collected_episodes(self.iteration + 1) * self.real.shooting.horizon,
-                "stage": STAGES.index(name) + 1,
-            }
-            self.iteration += 1
-            yield IterationResult({**head, **metrics}, self._seconds)
-
-    def stage(self, iteration: int) -> tuple[str, int]:
-        """Stage of an outer iteration, and its number within it."""
-        shooting, cloning = self.config.shooting_iterations, self.config.cloning.iterations
-        if iteration < shooting:
-            return "shooting", iteration
-        if iteration < shooting + cloning:
-            return "cloning", iteration - shooting
-        return "fine_tuning", iteration - shooting - cloning
+        stages = {"shooting": self._shoot, "cloning": self._clone, "fine_tuning": self._fine_tune}
+        for iteration in self.rounds():
+            name, number = self.config.stage(iteration)
+            metrics = stages[name](number)
+            collected = self.config.collected_episodes(iteration + 1) * self.episode_steps
+            stage = {"stage": self.facts.position(name) + 1}
+            yield self.result(self.start.frames + collected, {**stage, **metrics})
 
     def _shoot(self, number: int) -> dict[str, float]:
         """Stage 1: fit the model, let the planner act, with L1 around it if it is on."""
         if number == 0:
-            with self._phase("random", "random data"):
-                self.learning.store(self.real.start.random(self.seed, self._bounds()))
-        fit = self._fit()
-        with self._phase("collect", "planning and collecting"):
-            data = self.real.shooting.collect(self.seed, self.iteration)
+            with self.phase("random"):
+                self.learning.store(self.start.random(self.seed, self._bounds()))
+        fit = self.fit()
+        with self.phase("collect", "planning and collecting"):
+            data = self.shooting.collect(self.seed, self.iteration)
             self.learning.store(data)
             # What follows in a plan that is a few steps old does not answer the state.
             planned = data[(data["plan", "step"] % self.config.replan_every == 0).squeeze(-1)]
             self.cloning.store(planned["observation"], planned["action"])
         full = data
-        if self.real.shooting.horizon < self.real.shooting_measured.horizon:
-            with self._phase("evaluate", "evaluating"):
-                full = self.real.shooting_measured.evaluate(self.seed, self.iteration)
+        if self.shooting.horizon < self.shooting_measured.horizon:
+            with self.phase("evaluate"):
+                full = self.shooting_measured.evaluate(self.seed, self.iteration)
         return {
-            **_returns(full),
+            **returns_of_one_way(full),
             **signal_metrics(data),
             **fit,
             "plan/promised_return": _finite_mean(data["next", "plan", "best_return"]),
@@ -164,10 +179,10 @@ class MBMF:
 
     def _clone(self, number: int) -> dict[str, float]:
         """Stage 2: the policy visits states, the planner labels them, the policy is fitted."""
-        metrics = self._fit()
+        metrics = self.fit()
         if number > 0:
-            with self._phase("collect", "visiting states and labelling them"):
-                data = self.real.visits.collect(self.seed, self.iteration)
+            with self.phase("collect", "visiting states and labelling them"):
+                data = self.visits.collect(self.seed, self.iteration)
                 self.learning.store(data)
                 states = data["observation"].flatten(0, 1)
                 plans = self.labeller.plan(states)
@@ -175,14 +190,14 @@ class MBMF:
                 self.cloning.store(states[found], plans.actions[:, 0].cpu()[found])
             metrics |= signal_metrics(data)
             metrics["plan/promised_return"] = _finite_mean(plans.best_return)
-        with self._phase("clone", "cloning"):
+        with self.phase("clone"):
             report = self.cloning.fit(lambda epoch: self.on_phase(f"cloning, epoch {epoch}"))
-        with self._phase("evaluate", "evaluating"):
-            measured = self.real.clone_measured.evaluate(self.seed, self.iteration)
+        with self.phase("evaluate"):
+            measured = self.clone_measured.evaluate(self.seed, self.iteration)
         return {
-            **_returns(measured),
+            **returns_of_one_way(measured),
             **metrics,
-            **cloning_metrics(report, len(self.cloning.buffer)),
+            **report.metrics(len(self.cloning.buffer)),
         }
 
     def _fine_tune(self, number: int) -> dict[str, float]:
@@ -191,46 +206,24 @@ class MBMF:
         if number == 0:
             self.policy.load_state_dict(self.clone.state_dict())
             self.policy.reset_std(config.std)
-        with self._phase("collect", "collecting"):
-            data = self.real.practice.collect(self.seed, self.iteration)
-        done = number * self.real.practice.frames / (config.anneal_steps or math.inf)
-        with self._phase("tune", "PPO"):
+        with self.phase("collect"):
+            data = self.practice.collect(self.seed, self.iteration)
+        done = number * self.practice.frames / (config.anneal_steps or math.inf)
+        with self.phase("tune"):
             report = self.fine_tuning.step(data, min(done, 1.0))
-        with self._phase("evaluate", "evaluating"):
-            practice, measured = self.real.practice, self.real.policy_measured
+        with self.phase("evaluate"):
+            practice, measured = self.practice, self.policy_measured
             returns = policy_returns(data, practice, measured, self.seed, self.iteration)
         return {
             **returns,
             **signal_metrics(data),
-            **fine_tuning_metrics(report),
+            **report.metrics(),
             "policy/std": self.policy.log_std.detach().exp().mean().item(),
         }
 
-    def _fit(self) -> dict[str, float]:
-        with self._phase("fit", "fit"):
-            report = self.learning.fit(lambda epoch: self.on_phase(f"fit, epoch {epoch}"))
-            self.acting_dynamics.load_state_dict(self.dynamics.state_dict())
-        return fit_metrics(report)
-
-    @contextmanager
-    def _phase(self, name: str, words: str) -> Iterator[None]:
-        self.on_phase(words)
-        start = perf_counter()
-        yield
-        self._seconds[name] += perf_counter() - start
-
     def _planner(self, shooting: ShootingConfig) -> ModelPredictiveController:
-        config, task = self.config, self.task
-        sampler = TrajectorySampler(
-            self.dynamics,
-            task.imagined_reward,
-            task.terminated if task.terminates else None,
-            config.particles,
-            config.propagation,  # type: ignore[arg-type]
-            config.precision,  # type: ignore[arg-type]
-            discount=config.plan_discount,
-            compile=config.compile_plans,  # type: ignore[arg-type]
-        )
+        config = self.config
+        sampler = make_sampler(config, self.dynamics, self.task, discount=config.plan_discount)
         return ModelPredictiveController(
             sampler, shooting, *self._bounds(), replan_every=config.replan_every
         )
@@ -243,55 +236,44 @@ class MBMF:
     @property
     def policies(self) -> Mapping[str, TensorDictModuleBase]:
         """What acts in real environments after each stage, those that have begun."""
-        rounds = max(self.iteration - 1, 0)
-        reached = STAGES.index(self.stage(rounds)[0]) + 1
-        every = (self.real.shooting, self.real.clone_measured, self.real.policy_measured)
-        return {
-            name: collection.policy
-            for name, collection in zip(STAGES[:reached], every[:reached], strict=True)
-        }
+        last, _ = self.config.stage(max(self.iteration - 1, 0))
+        every = (self.shooting, self.clone_measured, self.policy_measured)
+        named = zip(self.facts.stage_names, every, strict=True)
+        policies = {name: collection.policy for name, collection in named}
+        return dict(list(policies.items())[: self.facts.position(last) + 1])
 
     def choices(self) -> dict[str, str]:
         """Where plans are made, in which precision, and whether compiled."""
-        return {"device": str(self.device), **self.planner.sampler.choices()}
+        return {**super().choices(), **self.planner.sampler.choices()}
 
     def weights(self) -> dict[str, dict[str, Any]]:
         """State dicts of the model, the cloned policy and the one that PPO improves.
 
         The policies are there once their stage has begun.
         """
-        networks = {"model": self.dynamics, "clone": self.clone, "policy": self.policy}
-        reached = list(networks.items())[: len(self.policies)]
-        return {name: network.state_dict() for name, network in reached}
+        networks = {"clone": self.clone, "policy": self.policy}
+        reached = list(networks.items())[: len(self.policies) - 1]
+        return {**super().weights(), **{name: net.state_dict() for name, net in reached}}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue, as plain tensors and numbers."""
         return {
-            "iteration": self.iteration,
+            **super().state_dict(),
             "clone": self.clone.state_dict(),
             "policy": self.policy.state_dict(),
             "cloning": self.cloning.state_dict(),
             "fine_tuning": self.fine_tuning.state_dict(),
-            **self.learning.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        self.iteration = state["iteration"]
+        super().load_state_dict(state)
         self.clone.load_state_dict(state["clone"])
         self.policy.load_state_dict(state["policy"])
         self.cloning.load_state_dict(state["cloning"])
         self.fine_tuning.load_state_dict(state["fine_tuning"])
-        self.learning.load_state_dict(state)
-        self.acting_dynamics.load_state_dict(self.dynamics.state_dict())
 
 
 def _finite_mean(values: Tensor) -> float:
     """Mean of the values that are finite; NaN if none is."""
     return values[values.isfinite()].mean().item()
-
-
-def _returns(data: TensorDictBase) -> dict[str, float]:
-    """Returns of what acts in one way only."""
-    deterministic = episode_returns(data).mean().item()
-    return {**return_metrics(data), "return_deterministic": deterministic}

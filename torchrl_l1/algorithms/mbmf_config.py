@@ -14,8 +14,19 @@ from torchrl_l1.algorithms.config import (
     check_steps,
     check_widths,
 )
+from torchrl_l1.algorithms.facts import Stage
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.planning import ShootingConfig
+
+STAGES = (
+    Stage("shooting", "random shooting", policies=("stochastic",), is_planner=True),
+    # Each of its rounds fits the policy anew to all that is known by then.
+    Stage("cloning", "cloning", window=1, policies=("deterministic",)),
+    Stage("fine_tuning", "fine-tuning"),
+)
+"""The stages in turn."""
+
+STAGE_NAMES = tuple(stage.name for stage in STAGES)
 
 
 @dataclass
@@ -225,8 +236,17 @@ class MBMFConfig:
             + (iterations - shot - cloned) * self.fine_tuning.episodes
         )
 
+    def stage(self, iteration: int) -> tuple[str, int]:
+        """Stage of an outer iteration, and its number within it."""
+        shooting, cloning, fine_tuning = STAGE_NAMES
+        if iteration < self.shooting_iterations:
+            return shooting, iteration
+        iteration -= self.shooting_iterations
+        if iteration < self.cloning.iterations:
+            return cloning, iteration
+        return fine_tuning, iteration - self.cloning.iterations
+
     def stages(self) -> tuple[str, ...]:
         """The stages that ``outer_iterations`` reaches."""
-        cloned = self.shooting_iterations + self.cloning.iterations
-        begin = {"shooting": 0, "cloning": self.shooting_iterations, "fine_tuning": cloned}
-        return tuple(name for name, first in begin.items() if first < self.outer_iterations)
+        last, _ = self.stage(self.outer_iterations - 1)
+        return STAGE_NAMES[: STAGE_NAMES.index(last) + 1]

@@ -8,50 +8,78 @@ the algorithm does not know of it (arXiv 2403.14860, algorithm 2).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from copy import deepcopy
 from functools import partial
-from itertools import pairwise
-from time import perf_counter
-from typing import Any
+from typing import Any, Unpack
 
 from tensordict.nn import TensorDictModuleBase
 
-from torchrl_l1.algorithms.algorithm import IterationResult, resolve_device, seed_streams
-from torchrl_l1.algorithms.collection import Collection, policy_returns, signal_metrics
-from torchrl_l1.algorithms.metrics import fit_metrics
+from torchrl_l1.algorithms.algorithm import (
+    COMMON_METRICS,
+    Algorithm,
+    IterationResult,
+    Surroundings,
+)
+from torchrl_l1.algorithms.collection import L1_METRICS, policy_returns, signal_metrics
+from torchrl_l1.algorithms.facts import AlgorithmFacts, Stage
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig, check_clipping
-from torchrl_l1.algorithms.metrpo_metrics import policy_metrics
 from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.policy import GaussianPolicy, acting
-from torchrl_l1.algorithms.policy_improvement import PolicyImprovement
-from torchrl_l1.compilation import CompileMode
+from torchrl_l1.algorithms.policy_improvement import (
+    POLICY_METRICS,
+    PolicyImprovement,
+    policy_metrics,
+)
 from torchrl_l1.control import L1Config
-from torchrl_l1.dynamics import make_dynamics
-from torchrl_l1.envs import Perturbation, get_task
+from torchrl_l1.dynamics.network import model_precision
+from torchrl_l1.envs import Perturbation
 
 
-class METRPO:
+class METRPO(Algorithm):
     """The algorithm and its state; :meth:`iterate` is the loop.
 
     Args:
         task: name of a task, see :data:`torchrl_l1.envs.TASKS`.
         config: settings.
         l1: the adaptive controller used in collection; ``None`` for none.
-        perturbation: noise and disturbances of the real environment.
-        seed: seed of every random stream. Streams are derived anew from the seed and the
-            iteration's number, so that a resumed run draws what an unbroken one would have.
-        horizon: steps per real episode; the task's own by default.
-        device: where models are fitted and trajectories imagined: ``cpu``, ``cuda`` or ``auto``.
-            Real environments, and the copies of policy and model that act in them, are on the
-            CPU.
-        compile_l1: whether to compile the controller's step, see
-            :class:`~torchrl_l1.control.L1Transform`.
-        on_phase: called with a word on what is going on, for progress bars.
+        perturbation: noise and disturbances of the real environments.
+        **surroundings: see :class:`~torchrl_l1.algorithms.Algorithm`.
 
     Raises:
         ValueError: if L1 is on and ``clip_actions`` is off.
     """
+
+    config_class = METRPOConfig
+    config: METRPOConfig
+    facts = AlgorithmFacts(
+        name="METRPO",
+        stages=(Stage("policy"),),
+        phases={
+            "random": "random data",
+            "fit": "fit",
+            "trpo": "TRPO",
+            "collect": "collecting",
+            "evaluate": "evaluating",
+        },
+        metrics={
+            **COMMON_METRICS,
+            "return_mean": "Mean return of real episodes of the stochastic policy, with L1 if it "
+            "is on; the paper's figure of merit. They are the episodes that join the data, unless "
+            "`episode_steps` makes those shorter than the task or one of them ended early; then "
+            "they are `evaluation_episodes` full ones beside the data.",
+            "return_deterministic": "Mean return of `evaluation_episodes` full episodes with the "
+            "policy's mean action (and L1 if it is on). They do not join the data and are not "
+            "counted as real steps.",
+            **POLICY_METRICS,
+            "policy/std": "Mean standard deviation of the policy at collection, action units.",
+            **L1_METRICS,
+        },
+        color="#000000",
+        tables={"training": "1", "sim_to_real": "2", "ablation": "5"},
+        compares_models=True,
+        reference_logs=True,
+    )
 
     def __init__(
         self,
@@ -59,92 +87,59 @@ class METRPO:
         config: METRPOConfig,
         l1: L1Config | None = None,
         perturbation: Perturbation | None = None,
-        seed: int = 0,
-        horizon: int | None = None,
-        device: str = "cpu",
-        compile_l1: CompileMode = False,
-        on_phase: Callable[[str], None] | None = None,
+        **surroundings: Unpack[Surroundings],
     ) -> None:
         check_clipping(config.clip_actions, l1 is not None)
-        self.config, self.seed = config, seed
-        self.device = resolve_device(device)
-        self.on_phase = on_phase or (lambda phase: None)
-        self.task = get_task(task)
+        super().__init__(task, config, l1, perturbation, **surroundings)
         n, m = self.task.observation_dim, self.task.action_dim
-        seed_streams(seed, "initialisation")
-        self.dynamics = make_dynamics(n, m, **vars(config.model)).to(self.device)
         self.policy = GaussianPolicy(n, m, config.policy.hidden, config.policy.std).to(self.device)
         self.improvement = PolicyImprovement(self.task, self.dynamics, self.policy, config)
         on_cpu = self.device.type == "cpu"
         self.acting_policy = self.policy if on_cpu else deepcopy(self.policy).cpu()
-        self.acting_dynamics = self.dynamics if on_cpu else deepcopy(self.dynamics).cpu()
-        real = partial(
-            Collection,
-            self.task,
-            policy=acting(self.acting_policy, self.task, config.clip_actions),
-            dynamics=self.acting_dynamics,
-            l1=l1,
-            perturbation=perturbation or Perturbation(),
-            compile_l1=compile_l1,
-        )
-        full = horizon or self.task.horizon
-        self.collection = real(
-            episodes=config.episodes_per_iteration, horizon=min(config.episode_steps or full, full)
-        )
-        self.evaluation = real(episodes=config.evaluation_episodes, horizon=full)
+        real = partial(self.real, policy=acting(self.acting_policy, self.task, config.clip_actions))
+        self.collection = real(episodes=config.episodes_per_iteration, horizon=self.episode_steps)
+        self.evaluation = real(episodes=config.evaluation_episodes, horizon=self.horizon)
         capacity = (config.outer_iterations + 1) * self.collection.frames
         self.learning = ModelLearning(self.dynamics, config.fit, config.label, capacity)
-        self.iteration = 0
 
     def iterate(self) -> Iterator[IterationResult]:
         """Run the outer iterations that are left, reporting after each."""
         config = self.config
-        while self.iteration < config.outer_iterations:
-            seed_streams(self.seed, "iteration", self.iteration)
-            clock = [perf_counter()]
+        for iteration in self.rounds():
             if len(self.learning.buffer) == 0:
-                self.on_phase("random data")
-                self.learning.store(self.collection.random(self.seed))
-            clock.append(perf_counter())
+                with self.phase("random"):
+                    self.learning.store(self.collection.random(self.seed))
 
-            fit = self.learning.fit(lambda epoch: self.on_phase(f"fit, epoch {epoch}"))
-            clock.append(perf_counter())
+            fit = self.fit()
 
-            if config.policy.normalize:
-                self.policy.normalizer.fit(self.learning.buffer[:]["observation"])
-            if config.policy.reset_std:
-                self.policy.reset_std(config.policy.std)
-            steps = []
-            for step in range(config.trpo_iterations):
-                self.on_phase(f"TRPO {step + 1}/{config.trpo_iterations}")
-                steps.append(self.improvement.step(self.learning.buffer))
-            clock.append(perf_counter())
+            with self.phase("trpo"):
+                if config.policy.normalize:
+                    self.policy.normalizer.fit(self.learning.buffer[:]["observation"])
+                if config.policy.reset_std:
+                    self.policy.reset_std(config.policy.std)
+                steps = []
+                for step in range(config.trpo_iterations):
+                    self.on_phase(f"TRPO {step + 1}/{config.trpo_iterations}")
+                    steps.append(self.improvement.step(self.learning.buffer))
 
-            self.on_phase("collecting")
-            self.acting_policy.load_state_dict(self.policy.state_dict())
-            self.acting_dynamics.load_state_dict(self.dynamics.state_dict())
-            data = self.collection.collect(self.seed, self.iteration)
-            self.learning.store(data)
-            clock.append(perf_counter())
-            self.on_phase("evaluating")
-            returns = policy_returns(
-                data, self.collection, self.evaluation, self.seed, self.iteration
-            )
-            clock.append(perf_counter())
+            with self.phase("collect"):
+                self.acting_policy.load_state_dict(self.policy.state_dict())
+                data = self.collection.collect(self.seed, iteration)
+                self.learning.store(data)
+
+            with self.phase("evaluate"):
+                returns = policy_returns(
+                    data, self.collection, self.evaluation, self.seed, iteration
+                )
 
             metrics = {
-                "iteration": self.iteration,
-                "real_steps": (self.iteration + 2) * self.collection.frames,
                 **returns,
                 **signal_metrics(data),
-                **fit_metrics(fit),
+                **fit,
                 **policy_metrics(steps),
                 "policy/std": self.policy.log_std.detach().exp().mean().item(),
             }
-            self.iteration += 1
-            phases = ("random", "fit", "trpo", "collect", "evaluate")
-            seconds = [after - before for before, after in pairwise(clock)]
-            yield IterationResult(metrics, dict(zip(phases, seconds, strict=True)))
+            yield self.result((iteration + 2) * self.collection.frames, metrics)
 
     @property
     def policies(self) -> Mapping[str, TensorDictModuleBase]:
@@ -152,25 +147,24 @@ class METRPO:
         return {"policy": self.collection.policy}
 
     def choices(self) -> dict[str, str]:
-        """Where models are fitted and trajectories imagined."""
-        return {"device": str(self.device)}
+        """Where and in which precision models are fitted and trajectories imagined."""
+        imagination = model_precision(self.dynamics, self.config.precision)
+        return {**super().choices(), "imagination": imagination}
 
     def weights(self) -> dict[str, dict[str, Any]]:
         """State dicts of model and policy."""
-        return {"model": self.dynamics.state_dict(), "policy": self.policy.state_dict()}
+        return {**super().weights(), "policy": self.policy.state_dict()}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue, as plain tensors and numbers."""
         return {
-            "iteration": self.iteration,
+            **super().state_dict(),
             "policy": self.policy.state_dict(),
             "improvement": self.improvement.state_dict(),
-            **self.learning.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        self.iteration = state["iteration"]
+        super().load_state_dict(state)
         self.policy.load_state_dict(state["policy"])
         self.improvement.load_state_dict(state["improvement"])
-        self.learning.load_state_dict(state)

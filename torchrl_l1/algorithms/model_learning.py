@@ -11,6 +11,14 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, FitReport, fit_ensemble
 
+FIT_METRICS: dict[str, str] = {
+    "model/train_loss": "Mean training loss of a member in the last epoch, normalised units.",
+    "model/validation_loss": "Mean over members of the lowest validation loss, the weights kept.",
+    "model/epochs": "Passes over the training data.",
+    "model/gradient_steps": "Adam steps.",
+}
+"""What a fit of the model reports."""
+
 
 class ModelLearning:
     """A model, the real transitions seen so far, and the fits of one to the other.
@@ -71,3 +79,13 @@ class ModelLearning:
         self.buffer.empty()
         if state["buffer"]:
             self.buffer.extend(TensorDict(state["buffer"]).auto_batch_size_(1))
+
+
+def fit_metrics(fit: FitReport) -> dict[str, float]:
+    """Metrics of the fit of the ensemble."""
+    return {
+        "model/train_loss": fit.train_loss,
+        "model/validation_loss": fit.validation_loss,
+        "model/epochs": fit.epochs,
+        "model/gradient_steps": fit.gradient_steps,
+    }

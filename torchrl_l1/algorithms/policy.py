@@ -6,10 +6,16 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
+from torchrl_l1.algorithms.facts import KINDS
 from torchrl_l1.dynamics import Normalizer
 from torchrl_l1.envs import Task
 
@@ -132,3 +138,15 @@ def acting(policy: GaussianPolicy, task: Task, clip: bool = True) -> TensorDictM
         return actor
     low, high = (torch.full((task.action_dim,), b) for b in (task.action_low, task.action_high))
     return clipped(actor, low, high)
+
+
+def kinds_of(policy: TensorDictModuleBase) -> tuple[str, ...]:
+    """The ways to act that differ: both for a distribution over actions, else ``stochastic``.
+
+    Examples:
+        >>> from tensordict.nn import TensorDictModule
+        >>> kinds_of(TensorDictModule(lambda x: x, ["observation"], ["action"]))
+        ('stochastic',)
+    """
+    samples = any(isinstance(part, ProbabilisticTensorDictModule) for part in policy.modules())
+    return KINDS if samples else KINDS[:1]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -11,7 +13,6 @@ from torchrl.data import ReplayBuffer
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig
-from torchrl_l1.algorithms.metrpo_metrics import PolicyStep
 from torchrl_l1.algorithms.policy import GaussianPolicy, make_actor
 from torchrl_l1.dynamics import EnsembleDynamics, imagine
 from torchrl_l1.envs import StartStates, Task
@@ -23,48 +24,25 @@ from torchrl_l1.objectives import (
     trpo_step,
 )
 
+POLICY_METRICS: dict[str, str] = {
+    "imagined/return_first": "Mean imagined return before the first TRPO step.",
+    "imagined/return_last": "Mean imagined return before the last TRPO step.",
+    "imagined/left_box": "Share of imagined trajectories that left the box around the data, in "
+    "the last TRPO step. High values mean that the policy exploits the model.",
+    "trpo/kl": "Mean KL divergence per TRPO step, nats.",
+    "trpo/improvement": "Mean gain of the surrogate per TRPO step.",
+    "trpo/accepted": "Share of TRPO steps whose line search succeeded.",
+}
+"""What the policy's improvement reports: all TRPO steps of an outer iteration."""
 
-def imagined_advantages(
-    trajectories: TensorDictBase,
-    value: Tensor,
-    last_value: Tensor,
-    discount: float,
-    gae_lambda: float,
-    box_exit: str,
-) -> tuple[Tensor, Tensor]:
-    """Generalized advantage estimate (arXiv 1506.02438) of trajectories that may end early.
 
-    What follows an exit from the data's box is unknown. To call it zero (``box_exit="fail"``)
-    rewards leaving wherever rewards are negative; ``"truncate"`` lets the value of the last state
-    inside stand for it. Nothing follows where the task itself ends.
+@dataclass
+class PolicyStep:
+    """One TRPO step: its report, and what the trajectories that it learnt from were like."""
 
-    Args:
-        trajectories: from :func:`~torchrl_l1.dynamics.imagine`, batch size ``[B, T]``.
-        value: the baseline's value of each ``observation`` ``(B, T, 1)``.
-        last_value: what follows the last step ``(B, 1, 1)``: zero if the task ends there.
-        discount: gamma.
-        gae_lambda: lambda.
-        box_exit: ``"truncate"`` or ``"fail"``.
-
-    Returns:
-        advantages and value targets ``(B, T, 1)``; they mean nothing where ``valid`` is false.
-    """
-    done = trajectories["next", "done"]
-    terminated = trajectories["next", "terminated"]
-    if box_exit == "fail":
-        terminated = terminated | trajectories["next", "left_box"]
-    # After an exit the observation stays that of the last state inside, and so does its value.
-    next_value = torch.cat([value[:, 1:], last_value], dim=1)
-    advantage, target = generalized_advantage_estimate(
-        discount,
-        gae_lambda,
-        value,
-        next_value,
-        trajectories["next", "reward"],
-        done=done,
-        terminated=terminated,
-    )
-    return advantage, target
+    report: TRPOReport
+    imagined_return: float
+    left_box: float
 
 
 class PolicyImprovement:
@@ -101,6 +79,7 @@ class PolicyImprovement:
             self.action_low,
             self.action_high,
             self.task.terminated if config.imagined_termination else None,
+            precision=config.precision,  # type: ignore[arg-type]
         )
         observation, step = trajectories["observation"], trajectories["step"]
         if config.bootstrap:
@@ -152,6 +131,62 @@ class PolicyImprovement:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
         self.baseline.load_state_dict(state)
+
+
+def policy_metrics(steps: list[PolicyStep]) -> dict[str, float]:
+    """Metrics of the policy's improvement: all TRPO steps of an outer iteration."""
+    reports = [step.report for step in steps]
+    return {
+        "imagined/return_first": steps[0].imagined_return,
+        "imagined/return_last": steps[-1].imagined_return,
+        "imagined/left_box": steps[-1].left_box,
+        "trpo/kl": fmean(report.kl for report in reports),
+        "trpo/improvement": fmean(report.improvement for report in reports),
+        "trpo/accepted": fmean(report.accepted for report in reports),
+    }
+
+
+def imagined_advantages(
+    trajectories: TensorDictBase,
+    value: Tensor,
+    last_value: Tensor,
+    discount: float,
+    gae_lambda: float,
+    box_exit: str,
+) -> tuple[Tensor, Tensor]:
+    """Generalized advantage estimate (arXiv 1506.02438) of trajectories that may end early.
+
+    What follows an exit from the data's box is unknown. To call it zero (``box_exit="fail"``)
+    rewards leaving wherever rewards are negative; ``"truncate"`` lets the value of the last state
+    inside stand for it. Nothing follows where the task itself ends.
+
+    Args:
+        trajectories: from :func:`~torchrl_l1.dynamics.imagine`, batch size ``[B, T]``.
+        value: the baseline's value of each ``observation`` ``(B, T, 1)``.
+        last_value: what follows the last step ``(B, 1, 1)``: zero if the task ends there.
+        discount: gamma.
+        gae_lambda: lambda.
+        box_exit: ``"truncate"`` or ``"fail"``.
+
+    Returns:
+        advantages and value targets ``(B, T, 1)``; they mean nothing where ``valid`` is false.
+    """
+    done = trajectories["next", "done"]
+    terminated = trajectories["next", "terminated"]
+    if box_exit == "fail":
+        terminated = terminated | trajectories["next", "left_box"]
+    # After an exit the observation stays that of the last state inside, and so does its value.
+    next_value = torch.cat([value[:, 1:], last_value], dim=1)
+    advantage, target = generalized_advantage_estimate(
+        discount,
+        gae_lambda,
+        value,
+        next_value,
+        trajectories["next", "reward"],
+        done=done,
+        terminated=terminated,
+    )
+    return advantage, target
 
 
 def _standardize(advantage: Tensor) -> Tensor:

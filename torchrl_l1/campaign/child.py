@@ -51,10 +51,11 @@ def main(arguments: Sequence[str]) -> None:
 def train(settings: Mapping[str, Any]) -> None:
     """Train or go on as the campaign has planned it, whatever has become of the recipe since.
 
-    Exits with ``EX_TEMPFAIL`` if another process is running in the run directory.
+    Exits with the status ``TEMPORARY_FAILURE`` if another process is running in the run directory.
     """
     from omegaconf import DictConfig, OmegaConf
 
+    from torchrl_l1.campaign.workers import TEMPORARY_FAILURE
     from torchrl_l1.experiment.errors import USER_ERRORS, message
     from torchrl_l1.experiment.run import run
     from torchrl_l1.experiment.run_directory import RunDirectoryInUse
@@ -66,7 +67,7 @@ def train(settings: Mapping[str, Any]) -> None:
         run(config)
     except RunDirectoryInUse as error:
         print(error, file=sys.stderr)
-        sys.exit(os.EX_TEMPFAIL)
+        sys.exit(TEMPORARY_FAILURE)
     except USER_ERRORS as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import fcntl
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -22,7 +21,7 @@ from torchrl_l1.campaign.plan import check_devices, plan
 from torchrl_l1.campaign.progress import overview
 from torchrl_l1.campaign.reuse import copy_run, find_reusable
 from torchrl_l1.campaign.workers import Stopped, available_cores
-from torchrl_l1.experiment.run_directory import write_atomically
+from torchrl_l1.experiment.run_directory import locked, write_atomically
 
 
 def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> None:
@@ -93,11 +92,9 @@ def _check_owner(output: Path, campaign: Campaign) -> None:
 
 @contextmanager
 def _hold(output: Path) -> Iterator[None]:
-    with (output / ".lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
+    with locked(output / ".lock") as ours:
+        if not ours:
             raise CampaignError(
                 f"another campaign is running in {output}; wait for it, or choose another --output"
-            ) from error
+            )
         yield

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml  # type: ignore[import-untyped]
 
-from torchrl_l1.experiment.l1_options import check_tuning
+from torchrl_l1.experiment.matrix import Axis, axes, check_values
 from torchrl_l1.experiment.recipes import find_campaign
-from torchrl_l1.experiment.stages import KINDS
 
 
 class _Loader(yaml.SafeLoader):
@@ -136,32 +134,19 @@ class EvaluationSettings:
     Attributes:
         name: of the table ``RUN_DIR/evaluations/NAME.csv``.
         where: values that a run must have, by matrix key (or ``recipe``); no key, every run.
-        l1: settings of the ``l1`` group.
-        noise: settings of the ``noise`` group.
-        bias: actuator biases, action units.
-        gain: actuator gains.
-        policy: ``stochastic`` and ``deterministic``; a planner, which acts in one way only, is
-            tested once.
+        matrix: what is varied: values by the names of :func:`~torchrl_l1.experiment.matrix.axes`,
+            which are keys of the campaign file beside the others. Where none are given they are
+            those of the axis. For ``epsilon`` and ``alpha`` a number or null will do. A planner,
+            which acts in one way only, is tested once whatever ``policy`` says.
         episodes: episodes per cell.
         seed: seed of resets, noise and sampled actions.
-        epsilon: tolerances of the switching law, raw state units, as a number or a list; the
-            run's own if null.
-        alpha: gains of the filter per step, as a number or a list; the controller's own if null.
-        stage: stages of the algorithm whose policies are tested; the last one if empty.
     """
 
     name: str
     where: dict[str, list[Any]] = field(default_factory=dict)
-    l1: list[str] = field(default_factory=lambda: ["off", "paper"])
-    noise: list[str] = field(default_factory=lambda: ["none"])
-    bias: list[float] = field(default_factory=lambda: [0.0])
-    gain: list[float] = field(default_factory=lambda: [1.0])
-    policy: list[str] = field(default_factory=lambda: list(KINDS))
+    matrix: dict[str, list[Any]] = field(default_factory=dict)
     episodes: int = 25
     seed: int = 0
-    epsilon: list[float] = field(default_factory=list)
-    alpha: list[float] = field(default_factory=list)
-    stage: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not _PLAIN.fullmatch(self.name):
@@ -170,33 +155,46 @@ class EvaluationSettings:
             raise CampaignError(f"where must map keys to lists of values, got {self.where!r}")
         for key, values in self.where.items():
             _check_list(f"where.{key}", values, (str, int, float), filled=True)
-        for key in ("l1", "noise", "policy"):
-            _check_list(key, getattr(self, key), str, filled=True)
-        _check_list("stage", self.stage, str)
-        for key in ("bias", "gain"):
-            _check_list(key, getattr(self, key), (int, float), filled=True)
-            setattr(self, key, [float(value) for value in getattr(self, key)])
-            if not all(map(math.isfinite, getattr(self, key))):
-                raise CampaignError(f"{key} must be finite, got {getattr(self, key)}")
-        unknown = [policy for policy in self.policy if policy not in KINDS]
-        if unknown:
-            raise CampaignError(f"unknown policy {unknown[0]!r}; there are {', '.join(KINDS)}")
+        every = axes()
+        for key in self.matrix:
+            if key not in [axis.name for axis in every]:
+                raise CampaignError(f"an evaluation does not vary {key!r}")
+        self.matrix = {axis.name: _axis_values(axis, self.matrix) for axis in every}
         for key, least in (("episodes", 1), ("seed", 0)):
             value = getattr(self, key)
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
                 raise CampaignError(f"{key} must be a whole number from {least}, got {value!r}")
-        self.epsilon = _numbers("epsilon", self.epsilon)
-        self.alpha = _numbers("alpha", self.alpha)
         try:
-            check_tuning(self.epsilon, self.alpha)
+            check_values(self.matrix)
         except ValueError as error:
             raise CampaignError(str(error)) from error
 
+    @staticmethod
+    def keys() -> list[str]:
+        """The keys in a campaign file."""
+        return ["name", "where", *(axis.name for axis in axes()), "episodes", "seed"]
+
+    @classmethod
+    def from_keys(cls, **entry: Any) -> EvaluationSettings:
+        """From the :meth:`keys` of a campaign file, those of the matrix beside the others.
+
+        Raises:
+            CampaignError: for a value of the wrong kind.
+            TypeError: for any other key.
+        """
+        varied = {axis.name for axis in axes()}
+        rest = {key: value for key, value in entry.items() if key not in varied}
+        if "matrix" in rest:
+            raise TypeError("matrix is no key of an evaluation")
+        return cls(**rest, matrix={key: entry[key] for key in entry if key in varied})
+
+    def to_keys(self) -> dict[str, Any]:
+        """The keys with their values, all of them."""
+        return {"name": self.name, "where": self.where, **self.of_a_run()}
+
     def of_a_run(self) -> dict[str, Any]:
-        """What the table of a single run depends on: all settings but ``name`` and ``where``."""
-        settings = asdict(self)
-        del settings["name"], settings["where"]
-        return settings
+        """What the table of a single run depends on: all keys but ``name`` and ``where``."""
+        return {**self.matrix, "episodes": self.episodes, "seed": self.seed}
 
 
 @dataclass
@@ -221,7 +219,7 @@ class Campaign:
         """The resolved campaign as plain lists and dictionaries."""
         whole = asdict(self)
         del whole["file"]
-        return whole
+        return {**whole, "evaluations": [settings.to_keys() for settings in self.evaluations]}
 
 
 def value_text(value: Any) -> str:
@@ -248,6 +246,18 @@ def override_key(override: str) -> str:
     if not equals or not key.strip("+~"):
         raise CampaignError(f"{override!r} is not an override; write KEY=VALUE")
     return key.strip("+~").partition("@")[0]
+
+
+def _axis_values(axis: Axis, given: Mapping[str, Any]) -> list[Any]:
+    """The values of an axis: text, or numbers; some axes may be left to the run."""
+    values = given.get(axis.name, list(axis.values))
+    if axis.kind is float and not axis.values:
+        return _numbers(axis.name, values)
+    if axis.kind is float:
+        _check_list(axis.name, values, (int, float), filled=True)
+        return [float(value) for value in values]
+    _check_list(axis.name, values, str, filled=bool(axis.values))
+    return list(values)
 
 
 def _numbers(key: str, value: Any) -> list[float]:
@@ -299,7 +309,11 @@ def read_campaign(name: str, overrides: Sequence[str] = ()) -> Campaign:
     for key in ("runs", "evaluations"):
         if not isinstance(content.get(key, []), list) or content.get(key, [None]) == []:
             raise CampaignError(f"{file}: {key} must be a list with at least one entry")
-    runs = [_build(RunMatrix, file, f"runs[{i}]", entry) for i, entry in enumerate(content["runs"])]
+    parts = [part.name for part in fields(RunMatrix)]
+    runs = [
+        _build(RunMatrix, file, f"runs[{i}]", entry, parts, "recipe")
+        for i, entry in enumerate(content["runs"])
+    ]
     for i, matrix in enumerate(runs):
         own = file.parent / str(matrix.recipe)
         try:
@@ -313,21 +327,22 @@ def read_campaign(name: str, overrides: Sequence[str] = ()) -> Campaign:
         except CampaignError as error:
             raise CampaignError(f"{file}: runs[{i}]: {error}") from error
     evaluations = [
-        _build(EvaluationSettings, file, f"evaluations[{i}]", entry)
+        _build(
+            EvaluationSettings.from_keys, file, f"evaluations[{i}]", entry,
+            EvaluationSettings.keys(), "name",
+        )
         for i, entry in enumerate(content.get("evaluations", []))
-    ]
+    ]  # fmt: skip
     title = str(content.get("name", file.stem))
     return Campaign(title, file, str(content.get("description", "")), runs, evaluations)
 
 
-def _build(kind: type[T], file: Path, where: str, entry: Any) -> T:
-    parts = fields(kind)  # type: ignore[arg-type]
-    required = [
-        part.name for part in parts if part.default is MISSING and part.default_factory is MISSING
-    ]
-    _check_keys(file, where, entry, [part.name for part in parts], required)
+def _build(
+    make: Callable[..., T], file: Path, where: str, entry: Any, known: Sequence[str], required: str
+) -> T:
+    _check_keys(file, where, entry, known, [required])
     try:
-        return kind(**entry)
+        return make(**entry)
     except CampaignError as error:
         raise CampaignError(f"{file}: {where}: {error}") from error
 

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_l1.campaign.description import EvaluationSettings, dump_yaml, load_yaml
-from torchrl_l1.experiment.evaluate import conditions, distinct, evaluate, load_run
+from torchrl_l1.experiment.evaluate import distinct, evaluate, load_run
+from torchrl_l1.experiment.matrix import conditions
 from torchrl_l1.experiment.run_directory import RunDirectory, write_atomically, write_table
 
 
@@ -26,7 +27,7 @@ def is_evaluated(directory: RunDirectory, settings: EvaluationSettings) -> bool:
     try:
         before = load_yaml(table.with_suffix(".yaml"))
         iterations = before.pop("iterations")
-        made_with = EvaluationSettings(name=settings.name, **before)
+        made_with = EvaluationSettings.from_keys(name=settings.name, **before)
     except (OSError, ValueError, AttributeError, KeyError, TypeError):
         return False
     now = _described(settings, directory.iterations_done())
@@ -53,17 +54,8 @@ def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
         RunDirectoryError: if the directory holds no run or no checkpoint.
         ValueError: for a stage that the run has not; nothing is changed then.
     """
-    chosen = EvaluationSettings(name=name, **settings)
-    every = conditions(
-        chosen.l1,
-        chosen.noise,
-        chosen.bias,
-        chosen.gain,
-        chosen.policy,
-        chosen.epsilon,
-        chosen.alpha,
-        chosen.stage,
-    )
+    chosen = EvaluationSettings.from_keys(name=name, **settings)
+    every = conditions(**chosen.matrix)
     trained = load_run(run_dir)
     rows = list(evaluate(trained, distinct(trained, every), chosen.episodes, chosen.seed))
     table = evaluation_file(Path(run_dir), name)

@@ -26,8 +26,7 @@ from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run import check_mode
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError
-from torchrl_l1.experiment.settings import RunSettings, compile_mode, l1_config
-from torchrl_l1.experiment.stages import STAGES
+from torchrl_l1.experiment.settings import SCHEMAS, RunSettings, compile_mode, l1_config
 
 
 @dataclass
@@ -224,7 +223,7 @@ def _add_evaluations(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
         place = f"{campaign.file}: evaluations[{i}] ({settings.name})"
         try:
             for group in ("l1", "noise"):
-                for option in getattr(settings, group):
+                for option in settings.matrix[group]:
                     group_setting(group, option)
         except ValueError as error:
             raise CampaignError(f"{place}: {error}") from error
@@ -242,7 +241,7 @@ def _add_evaluations(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
         if not chosen:
             raise CampaignError(f"{place}: no run has all of where")
         for run in chosen:
-            _check_stages(place, run, settings.stage)
+            _check_stages(place, run, settings.matrix["stage"])
             if any(other.name == settings.name for other in run.evaluations):
                 raise CampaignError(
                     f"{place}: another evaluation of this name is for {run} too; give it another "
@@ -252,7 +251,8 @@ def _add_evaluations(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
 
 
 def _check_stages(place: str, run: PlannedRun, asked: Sequence[str]) -> None:
-    every, reached = STAGES[run.config.algorithm], run.stages()
+    every = SCHEMAS[run.config.algorithm].builds.facts.stage_names
+    reached = run.stages()
     for name in asked:
         if name not in every:
             raise CampaignError(

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
+# A process that found another one at its work; EX_TEMPFAIL, a name that Windows does not have.
+TEMPORARY_FAILURE = 75
 POLL_SECONDS = 0.1
 GRACE_SECONDS = 10.0
 _LAST_LINES = 15
@@ -72,8 +74,8 @@ class Stopped(Exception):
 class Workers:
     """Runs jobs, ``count`` at a time, in the calling thread.
 
-    A process that ends with the status ``EX_TEMPFAIL`` has found another one at its work; it is
-    started again once that has ended.
+    A process that ends with the status ``TEMPORARY_FAILURE`` has found another one at its work; it
+    is started again once that has ended.
 
     Each process has one thread and a session of its own, so that a Ctrl-C reaches the campaign
     alone, which then ends them. It must be the main thread: on Linux the system ends the
@@ -151,7 +153,7 @@ class Workers:
             if status is None:
                 continue
             self._running.remove(entry)
-            if status == os.EX_TEMPFAIL:
+            if status == TEMPORARY_FAILURE:
                 self._queue.append(job)
             elif status != 0:
                 how = f"signal {-status}" if status < 0 else f"status {status}"
@@ -164,13 +166,13 @@ class Workers:
 
     def _end_all(self) -> None:
         for _, process in self._running:
-            _signal_session(process, signal.SIGTERM)
+            _end(process)
         deadline = time.monotonic() + GRACE_SECONDS
         for _, process in self._running:
             try:
                 process.wait(max(deadline - time.monotonic(), 0))
             except subprocess.TimeoutExpired:
-                _signal_session(process, signal.SIGKILL)
+                _end(process, at_once=True)
                 process.wait()
         self._running.clear()
 
@@ -187,10 +189,13 @@ class Workers:
                 signal.signal(number, handler)
 
 
-def _signal_session(process: subprocess.Popen[bytes], number: int) -> None:
+def _end(process: subprocess.Popen[bytes], at_once: bool = False) -> None:
+    if os.name == "nt":  # there are no sessions
+        process.kill()
+        return
     # The session outlives its leader if that had children; once all are gone there is none.
     with suppress(ProcessLookupError):
-        os.killpg(process.pid, number)
+        os.killpg(process.pid, signal.SIGKILL if at_once else signal.SIGTERM)
 
 
 def available_cores() -> int:

@@ -17,7 +17,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _run_parser(commands)
     _campaign_parser(commands)
-    _evaluate_parser(commands)
+    _evaluate_parser(commands, asked="evaluate" in arguments[:1])
     _report_parser(commands)
     verify = commands.add_parser(
         "verify", help="replay recorded traces of a reference controller in float64"
@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
             evaluate_command(options)
         elif options.command == "report":
-            from torchrl_l1.report.command import report_command
+            from torchrl_l1.report.build import report_command
 
             report_command(options)
         elif options.command == "verify":
@@ -102,7 +102,9 @@ def _campaign_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
     add("--launcher", help="hand the runs to one of Hydra's launchers, such as joblib")
 
 
-def _evaluate_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _evaluate_parser(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser], asked: bool
+) -> None:
     evaluate = commands.add_parser(
         "evaluate",
         help="evaluate trained policies with L1 on and off under noise and disturbances",
@@ -110,43 +112,11 @@ def _evaluate_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
         "disturbance and stochastic or deterministic policy. Several run directories are seeds of "
         "one study.",
     )
-    add = evaluate.add_argument
-    add("run_dir", nargs="+", help="one or more run directories")
-    add("--l1", nargs="+", default=["off", "paper"], help="settings of the l1 group")
-    add("--noise", nargs="+", default=["none"], help="settings of the noise group")
-    add("--bias", nargs="+", type=float, default=[0.0], help="actuator biases, action units")
-    add("--gain", nargs="+", type=float, default=[1.0], help="actuator gains")
-    add(
-        "--epsilon",
-        nargs="+",
-        type=float,
-        default=[],
-        help="tolerances of the switching law; the run's own by default",
-    )
-    add(
-        "--alpha",
-        nargs="+",
-        type=float,
-        default=[],
-        help="gains of the filter per step; the controller's own by default",
-    )
-    add(
-        "--policy",
-        nargs="+",
-        choices=["stochastic", "deterministic"],
-        help="sampled or mean actions; both by default, and sampled ones where they are the same",
-    )
-    add(
-        "--stage",
-        nargs="+",
-        default=[],
-        help="stages whose policies are tested, of algorithms with several (shooting, cloning, "
-        "fine_tuning); the last that there is by default",
-    )
-    add("--episodes", type=int, default=25, help="episodes per cell and run")
-    add("--seed", type=int, default=0, help="seed of resets, noise and sampled actions")
-    add("--output", help="folder of the results; RUN_DIR/evaluation by default")
-    add("--filmstrip", action="store_true", help="also render L1 off and on at the worst bias")
+    # They come with all that evaluates and draws; no other command should wait for it.
+    if asked:
+        from torchrl_l1.cli.evaluate import add_arguments
+
+        add_arguments(evaluate)
 
 
 def _report_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

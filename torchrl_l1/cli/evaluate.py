@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from torchrl_l1.cli.robustness import plot_robustness, summarize, table
+from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.envs.rendering import (
     RenderingUnavailable,
     animation,
@@ -19,35 +20,59 @@ from torchrl_l1.envs.rendering import (
     rollout_frames,
 )
 from torchrl_l1.experiment.evaluate import (
-    Condition,
     TrainedRun,
-    conditions,
     distinct,
     evaluate,
     load_run,
     make_collection,
 )
-from torchrl_l1.experiment.l1_options import check_tuning
+from torchrl_l1.experiment.matrix import Condition, axes, check_values, conditions
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.experiment.settings import RunSettings, WandbSettings
-from torchrl_l1.experiment.stages import KINDS
+from torchrl_l1.report.evaluation_figures import RANGES, plot_disturbances
+from torchrl_l1.report.evaluation_summary import summarize, summary_tables
+from torchrl_l1.report.identity import facts
 
 _SECONDS_SHOWN = 4.0
 _COLUMNS = 10
 
 
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``torchrl-l1 evaluate``: one for all that it varies, and its own."""
+    add = parser.add_argument
+    add("run_dir", nargs="+", help="one or more run directories")
+    for axis in axes():
+        add(
+            f"--{axis.name}",
+            nargs="+",
+            type=axis.kind,
+            default=list(axis.values),
+            choices=axis.choices or None,
+            help=axis.help,
+        )
+    add("--episodes", type=int, default=25, help="episodes per cell and run")
+    add("--seed", type=int, default=0, help="seed of resets, noise and sampled actions")
+    add("--output", help="folder of the results; RUN_DIR/evaluation by default")
+    add(
+        "--filmstrip",
+        action="store_true",
+        help="also render L1 off and on at the worst value of the disturbance that is varied",
+    )
+
+
 def write_filmstrip(
     trained: TrainedRun,
     cells: Sequence[Condition],
+    disturbance: str,
     seed: int,
     output: Path,
 ) -> None:
     """Render one deterministic episode per condition into ``filmstrip.png`` and ``.gif``.
 
-    The conditions share their disturbance; rows are named by their controllers, and by their
-    stages where there are several. Where no headless OpenGL works, a line says so and nothing is
-    written.
+    The conditions share the disturbance of that name; rows are named by their controllers, and by
+    their stages where there are several. Where no headless OpenGL works, a line says so and nothing
+    is written.
     """
     task = trained.algorithm.task
     several = len({cell.stage for cell in cells}) > 1
@@ -62,7 +87,8 @@ def write_filmstrip(
         return
     strip = filmstrip(rows, output / "filmstrip.png", every=max(1, steps // _COLUMNS), dt=task.dt)
     moving = animation(rows, output / "rollout.gif", dt=task.dt)
-    print(f"Filmstrip at bias {cells[0].bias:g}: {strip}, animation: {moving}")
+    value = cells[0].disturbances[disturbance]
+    print(f"Filmstrip at {disturbance} {value:g}: {strip}, animation: {moving}")
 
 
 def _label(cell: Condition, several: bool) -> str:
@@ -114,29 +140,29 @@ def _stages(runs: Sequence[TrainedRun], asked: Sequence[str]) -> list[str]:
     return found[0]
 
 
+def _worst(values: Mapping[str, Sequence[float]]) -> tuple[str, float]:
+    """The first disturbance that is varied (or the first there is) where it is strongest."""
+    worst = [
+        (name, max(values[name], key=lambda value: abs(value - entry.neutral)))
+        for name, entry in DISTURBANCES.items()
+    ]
+    varied = [(name, value) for name, value in worst if value != DISTURBANCES[name].neutral]
+    return (varied or worst)[0]
+
+
 def evaluate_command(options: argparse.Namespace) -> None:
     """``torchrl-l1 evaluate``: table on the screen, CSV, PNG and, if asked, a filmstrip."""
-    check_tuning(options.epsilon, options.alpha, prefix="--")
-    for name in options.l1:
-        group_setting("l1", name)
-    for name in options.noise:
-        group_setting("noise", name)
+    values = {axis.name: getattr(options, axis.name) for axis in axes()}
+    check_values(values, prefix="--")
+    for group in ("l1", "noise"):
+        for name in values[group]:
+            group_setting(group, name)
     if options.episodes < 1:
         raise ValueError(f"--episodes must be positive, got {options.episodes}")
     runs = [load_run(path) for path in dict.fromkeys(map(Path, options.run_dir))]
     _check_one_study(runs)
-    stages = _stages(runs, options.stage)
-    every = conditions(
-        options.l1,
-        options.noise,
-        options.bias,
-        options.gain,
-        options.policy or KINDS,
-        options.epsilon,
-        options.alpha,
-        stages,
-    )
-    cells = distinct(runs[0], every)
+    values["stage"] = _stages(runs, options.stage)
+    cells = distinct(runs[0], conditions(**values))
     output = Path(options.output) if options.output else runs[0].path / "evaluation"
     rows = []
     total = len(runs) * len(cells)
@@ -148,15 +174,17 @@ def evaluate_command(options: argparse.Namespace) -> None:
 
     output.mkdir(parents=True, exist_ok=True)
     summary = summarize(rows)
-    print(table(summary))
+    print(f"\n{summary_tables(summary)}\n")
     write_table(output / "evaluation.csv", rows)
     write_table(output / "summary.csv", summary)
-    plot_robustness(summary, output / "robustness.png", title=runs[0].recipe.recipe)
+    recipe = runs[0].recipe
+    plot_disturbances(
+        summary, recipe.recipe, output / "robustness.png", facts(recipe.algorithm), (RANGES,), True
+    )
     print(f"Table: {output / 'evaluation.csv'}, {output / 'summary.csv'}")
     print(f"Plot: {output / 'robustness.png'}")
     if options.filmstrip:
-        worst = max(options.bias, key=abs)
-        tuning = (options.epsilon, options.alpha)
-        kind = ["deterministic"]
-        shown = conditions(options.l1, ["none"], [worst], [1.0], kind, *tuning, stages)
-        write_filmstrip(runs[0], shown, options.seed, output)
+        shown: dict[str, Any] = {name: [entry.neutral] for name, entry in DISTURBANCES.items()}
+        name, worst = _worst(values)
+        shown |= {name: [worst], "noise": ["none"], "policy": ["deterministic"]}
+        write_filmstrip(runs[0], conditions(**{**values, **shown}), name, options.seed, output)

@@ -9,9 +9,11 @@ from torchrl_l1.envs.factory import make_env
 from torchrl_l1.envs.gymnasium_env import MujocoTaskEnv, gymnasium_id, register_tasks
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
 from torchrl_l1.envs.perturbations import (
+    DISTURBANCES,
     ActionNoise,
     ActuatorBias,
     ActuatorGain,
+    Disturbance,
     ObservationNoise,
     Perturbation,
 )
@@ -22,12 +24,14 @@ from torchrl_l1.envs.tasks import TASKS, get_task
 register_tasks()
 
 __all__ = [
+    "DISTURBANCES",
     "TASKS",
     "ActionNoise",
     "ActuatorBias",
     "ActuatorGain",
     "BatchedMujocoEnv",
     "BatchedSimulator",
+    "Disturbance",
     "MujocoTaskEnv",
     "ObservationNoise",
     "Perturbation",

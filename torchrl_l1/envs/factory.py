@@ -8,7 +8,7 @@ import torch
 from torchrl.envs import Compose, Transform, TransformedEnv
 
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
-from torchrl_l1.envs.perturbations import ActionNoise, ActuatorBias, ActuatorGain, ObservationNoise
+from torchrl_l1.envs.perturbations import DISTURBANCES, ActionNoise, ObservationNoise
 from torchrl_l1.envs.task import Task
 
 
@@ -22,13 +22,12 @@ def make_env(
     *,
     action_noise: float = 0.0,
     observation_noise: float = 0.0,
-    actuator_bias: float | Sequence[float] = 0.0,
-    actuator_gain: float | Sequence[float] = 1.0,
     extra_transforms: Sequence[Transform] = (),
     seed: int | None = None,
     max_steps: int | None = None,
     dtype: torch.dtype = torch.float32,
     threads: int = 1,
+    **disturbances: float | Sequence[float],
 ) -> TransformedEnv:
     r"""Builds a benchmark environment with noise, disturbances and further transforms.
 
@@ -47,19 +46,22 @@ def make_env(
         num_envs: number of environments.
         action_noise: half-width of :class:`~torchrl_l1.envs.ActionNoise`.
         observation_noise: half-width of :class:`~torchrl_l1.envs.ObservationNoise`.
-        actuator_bias: constant of :class:`~torchrl_l1.envs.ActuatorBias`.
-        actuator_gain: factor of :class:`~torchrl_l1.envs.ActuatorGain`.
         extra_transforms: appended in this order, for example an ``L1Transform``.
         seed: seed of the resets; drawn from torch's global generator if ``None``.
         max_steps: steps after which an episode is truncated; the task's horizon if ``None``.
         dtype: floating dtype of observation, action and reward.
         threads: threads that share the physics.
+        **disturbances: values of the disturbances of :class:`~torchrl_l1.envs.Perturbation`,
+            one number or one for each action entry: ``actuator_bias``, the constant of
+            :class:`~torchrl_l1.envs.ActuatorBias`, and ``actuator_gain``, the factor of
+            :class:`~torchrl_l1.envs.ActuatorGain`.
 
     Returns:
         A ``TransformedEnv`` with batch size ``[num_envs]``.
 
     Raises:
         KeyError: if the task is unknown.
+        TypeError: for any other argument.
         ValueError: if a half-width is negative, or a number is not finite.
 
     Examples:
@@ -69,11 +71,17 @@ def make_env(
         >>> env.rollout(10)["next", "reward"].shape
         torch.Size([4, 10, 1])
     """
-    transforms: list[Transform] = []
-    if _differs(actuator_gain, 1.0):
-        transforms.append(ActuatorGain(actuator_gain))
-    if _differs(actuator_bias, 0.0):
-        transforms.append(ActuatorBias(actuator_bias))
+    known = {entry.setting: entry for entry in DISTURBANCES.values()}
+    for setting in disturbances:
+        if setting not in known:
+            raise TypeError(
+                f"make_env has no argument {setting!r}; its disturbances are {', '.join(known)}"
+            )
+    transforms: list[Transform] = [
+        entry.transform(disturbances[setting])
+        for setting, entry in reversed(known.items())
+        if setting in disturbances and _differs(disturbances[setting], entry.neutral)
+    ]
     if action_noise != 0:
         transforms.append(ActionNoise(action_noise))
     if observation_noise != 0:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -189,9 +190,71 @@ class ActuatorGain(_ActuatorDisturbance):
         super().__init__(torch.mul, gain, action_key)
 
 
+# Key of the metadata of a field.
+_DISTURBANCE = "disturbance"
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """A disturbance as recipes, evaluations and reports know it.
+
+    Attributes:
+        setting: key of ``perturbation`` in recipes, and argument of :func:`make_env`.
+        name: option of ``torchrl-l1 evaluate``, key of a campaign's evaluations, and column of
+            their tables.
+        transform: makes the transform that applies a value of it.
+        neutral: the value that changes nothing.
+        units: of its values, in words.
+        help: what its values are, in words.
+        matched: whether it acts as an input of the actuators would, so that L1 can cancel it.
+    """
+
+    setting: str
+    name: str
+    transform: Callable[[float | Sequence[float]], Transform]
+    neutral: float
+    units: str
+    help: str
+    matched: bool
+
+    @property
+    def words(self) -> str:
+        """Its name in sentences and at axes, such as ``actuator bias``."""
+        return self.setting.replace("_", " ")
+
+
+def disturbance(
+    name: str,
+    transform: Callable[[float | Sequence[float]], Transform],
+    *,
+    neutral: float,
+    units: str,
+    help: str,
+    matched: bool,
+) -> Any:
+    """A field of :class:`Perturbation` that is a :class:`Disturbance`, neutral by default."""
+    described = {"name": name, "transform": transform, "neutral": neutral}
+    described |= {"units": units, "help": help, "matched": matched}
+    return field(default=neutral, metadata={_DISTURBANCE: described})
+
+
+def disturbances_of(settings: type[Perturbation]) -> dict[str, Disturbance]:
+    """The disturbances among the fields of :class:`Perturbation`, by name."""
+    found = [
+        Disturbance(setting=part.name, **part.metadata[_DISTURBANCE])
+        for part in fields(settings)
+        if _DISTURBANCE in part.metadata
+    ]
+    return {entry.name: entry for entry in found}
+
+
 @dataclass
 class Perturbation:
     """What the real environment does that the model is not told.
+
+    A further disturbance is a :class:`~torchrl.envs.Transform` and a field here: options, keys,
+    columns, tables and figures follow from the field. Of several the first acts first on the
+    action that a controller sends.
 
     Attributes:
         action_noise: half-width of uniform noise on the executed action, action units.
@@ -202,8 +265,13 @@ class Perturbation:
 
     action_noise: float = 0.0
     observation_noise: float = 0.0
-    actuator_bias: float = 0.0
-    actuator_gain: float = 1.0
+    actuator_bias: float = disturbance(
+        "bias", ActuatorBias, neutral=0.0, units="action units",
+        help="actuator biases, action units", matched=True,
+    )  # fmt: skip
+    actuator_gain: float = disturbance(
+        "gain", ActuatorGain, neutral=1.0, units="factor", help="actuator gains", matched=True
+    )
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -211,3 +279,7 @@ class Perturbation:
                 raise ValueError(f"perturbation.{name} must be finite, got {value}")
             if name.endswith("_noise") and value < 0:
                 raise ValueError(f"perturbation.{name} must not be negative, got {value}")
+
+
+DISTURBANCES: Mapping[str, Disturbance] = disturbances_of(Perturbation)
+"""By name: what evaluations vary, and training too where a recipe says so."""

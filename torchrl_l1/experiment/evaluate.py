@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -17,49 +16,17 @@ from torchrl_l1.algorithms.collection import (
     return_metrics,
     signal_metrics,
 )
-from torchrl_l1.envs import Perturbation
+from torchrl_l1.algorithms.policy import kinds_of
+from torchrl_l1.envs import DISTURBANCES, Perturbation
 from torchrl_l1.experiment.l1_options import (
     closest_option,
-    controller_label,
     l1_option,
     same_controller,
 )
+from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run_directory import RunDirectory, RunDirectoryError, read_config
 from torchrl_l1.experiment.settings import L1Settings, RunSettings, l1_config, schema_of
-from torchrl_l1.experiment.stages import STAGES, find_stage, kinds_of
-
-
-@dataclass(frozen=True)
-class Condition:
-    """One cell: which controller, noise, disturbance and policy, and how this acts.
-
-    Attributes:
-        l1: option of the ``l1`` group.
-        noise: option of the ``noise`` group.
-        bias: actuator bias, action units.
-        gain: actuator gain.
-        policy: ``stochastic`` or ``deterministic``.
-        epsilon: tolerance of the switching law, raw state units; the run's own if ``None``.
-        alpha: gain of the filter per step; that of the option (or of the run's own controller)
-            if ``None``.
-        stage: whose policy it is, see :attr:`Algorithm.policies
-            <torchrl_l1.algorithms.algorithm.Algorithm.policies>`; the last one's if ``None``.
-    """
-
-    l1: str
-    noise: str
-    bias: float
-    gain: float
-    policy: str
-    epsilon: float | None = None
-    alpha: float | None = None
-    stage: str | None = None
-
-    @property
-    def controller(self) -> str:
-        """The controller in tables and figures, see :func:`controller_label`."""
-        return controller_label(self.l1, self.epsilon, self.alpha)
 
 
 @dataclass
@@ -71,15 +38,20 @@ class TrainedRun:
     algorithm: Algorithm
 
     def stage(self, name: str | None) -> str:
-        """The name of a stage that the run has reached, see :func:`find_stage`.
+        """The name of a stage that the run has reached; of the last one if ``None``.
 
         Raises:
             ValueError: if there is no such stage, or not yet, with the run and those it has.
         """
-        try:
-            return find_stage(self.algorithm.policies, name)
-        except ValueError as error:
-            raise ValueError(f"{self.path}: {error}") from error
+        reached = list(self.algorithm.policies)
+        if name is None:
+            return reached[-1]
+        if name not in reached:
+            there = "there are" if len(reached) > 1 else "there is"
+            raise ValueError(
+                f"{self.path}: no stage {name!r}, or not yet; {there} {', '.join(reached)}"
+            )
+        return name
 
 
 def load_run(path: str | Path) -> TrainedRun:
@@ -104,38 +76,6 @@ def load_run(path: str | Path) -> TrainedRun:
     algorithm = replace(recipe, **here).build()
     algorithm.load_state_dict({**checkpoint["algorithm"], "buffer": {}})
     return TrainedRun(directory.path, recipe, algorithm)
-
-
-def conditions(
-    l1: Sequence[str],
-    noise: Sequence[str],
-    bias: Sequence[float],
-    gain: Sequence[float],
-    policy: Sequence[str],
-    epsilon: Sequence[float] = (),
-    alpha: Sequence[float] = (),
-    stage: Sequence[str] = (),
-) -> list[Condition]:
-    """Every combination of controller, noise and policy with each bias and, apart, each gain.
-
-    Every controller but ``off`` is tested with each ``epsilon`` and each ``alpha``; without
-    values, as it is. Without a ``stage``, the last one's policy is tested.
-
-    Examples:
-        >>> cells = conditions(["off", "paper"], ["none"], [0.0], [1.0], ["stochastic"], [0.3, 1.0])
-        >>> [cell.controller for cell in cells]
-        ['off', 'paper epsilon=0.3', 'paper epsilon=1']
-    """
-    disturbances = [(b, 1.0) for b in bias] + [(0.0, g) for g in gain if g != 1.0]
-    tunings = list(product(epsilon or (None,), alpha or (None,)))
-    cells = product(stage or (None,), policy, noise, disturbances, l1)
-    return list(
-        dict.fromkeys(
-            Condition(on, n, b, g, p, *tuning, s)
-            for s, p, n, (b, g), on in cells
-            for tuning in (tunings if on != "off" else [(None, None)])
-        )
-    )
 
 
 def distinct(trained: TrainedRun, cells: Sequence[Condition]) -> list[Condition]:
@@ -190,9 +130,8 @@ def evaluate(
 def make_collection(trained: TrainedRun, cell: Condition, episodes: int) -> Collection:
     """The environments of one condition around the frozen policy and model."""
     settings = _tested_l1(trained, cell)
-    perturbation = Perturbation(
-        **group_setting("noise", cell.noise), actuator_bias=cell.bias, actuator_gain=cell.gain
-    )
+    disturbances = {DISTURBANCES[name].setting: value for name, value in cell.disturbances.items()}
+    perturbation = Perturbation(**group_setting("noise", cell.noise), **disturbances)
     return Collection(
         trained.algorithm.task,
         episodes,
@@ -205,8 +144,8 @@ def make_collection(trained: TrainedRun, cell: Condition, episodes: int) -> Coll
 
 
 def _columns(trained: TrainedRun, cell: Condition) -> dict[str, Any]:
-    columns = dict(vars(cell))
-    if len(STAGES[trained.recipe.algorithm]) == 1:
+    columns = cell.columns()
+    if not trained.algorithm.facts.named_stages:
         del columns["stage"]  # there is no choice, and nothing to say
     return columns
 

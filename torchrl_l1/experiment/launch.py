@@ -12,7 +12,12 @@ from hydra.errors import CompactHydraException
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_l1.experiment.errors import USER_ERRORS, message
-from torchrl_l1.experiment.recipes import find_recipe, recipes_dir, shared_dir
+from torchrl_l1.experiment.recipes import (
+    available_recipes,
+    find_recipe,
+    recipes_dir,
+    shared_dir,
+)
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.settings import SCHEMAS, register
 
@@ -31,6 +36,9 @@ _FLAGS_WITH_VALUE = (
     *("--cfg", "-c", "--package", "-p", "--info", "-i", "--config-dir", "-cd"),
     *("--config-name", "-cn", "--config-path", "-cp", "--experimental-rerun"),
 )
+
+
+_SCHEMA_NAMES = {f"{name}_recipe": name for name in SCHEMAS}
 
 
 def launch(name: str, arguments: Sequence[str]) -> None:
@@ -84,21 +92,34 @@ def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:
 
 
 def _search_path(recipe: Path) -> list[str]:
-    """Where Hydra looks for groups: beside the recipe, in ``shared`` and with its algorithm."""
-    groups = [recipes_dir() / name for name in _algorithms(recipe)]
-    folders = [shared_dir(), *(folder for folder in groups if folder != recipe.parent)]
-    quoted = ",".join(f"'file://{folder}'" for folder in folders)
+    """Where Hydra looks beside the recipe: with its algorithm, in ``shared``, and from the root."""
+    folders = [shared_dir(), *_folders(recipe), recipes_dir()]
+    unique = dict.fromkeys(folder for folder in folders if folder != recipe.parent)
+    quoted = ",".join(f"'file://{folder}'" for folder in unique)
     return [f"hydra.searchpath=[{quoted}]"]
 
 
-def _algorithms(recipe: Path) -> list[str]:
-    """Those whose schemas are among a recipe's defaults."""
+def _folders(recipe: Path) -> list[Path]:
+    """Those with the groups of a recipe: of the algorithms whose schemas it names or includes."""
+    found = []
+    for name in _included(recipe):
+        if name in _SCHEMA_NAMES:
+            found.append(recipes_dir() / _SCHEMA_NAMES[name])
+        elif name in available_recipes():
+            shipped = find_recipe(name)
+            found += [shipped.parent, *_folders(shipped)]
+    return found
+
+
+def _included(recipe: Path) -> list[str]:
+    """What the defaults of a recipe include, as ``pets_recipe`` and ``pets/half_cheetah``."""
     try:
         content = OmegaConf.to_container(OmegaConf.load(recipe))
     except (OSError, ValueError, yaml.YAMLError):
         return []  # Hydra says what is wrong with it
     defaults = content.get("defaults") if isinstance(content, dict) else None
-    return [name for name in SCHEMAS if f"{name}_recipe" in (defaults or [])]
+    names = [entry for entry in defaults or [] if isinstance(entry, str)]
+    return [name.partition("@")[0].removeprefix("/") for name in names]
 
 
 def _task(config: DictConfig) -> None:

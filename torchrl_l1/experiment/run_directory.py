@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import fcntl
 import io
 import json
 import os
@@ -17,6 +16,7 @@ from typing import Any
 
 import torch
 import yaml  # type: ignore[import-untyped]
+from filelock import lock_descriptor, unlock_descriptor
 from omegaconf import OmegaConf
 
 import torchrl_l1
@@ -89,6 +89,29 @@ class RunDirectoryInUse(RunDirectoryError):
     """Another process is running in the run directory."""
 
 
+@contextmanager
+def locked(file: Path, mode: str = "a") -> Iterator[bool]:
+    """Lock a file for as long as the block lasts, or say that another process has.
+
+    The lock is this process's, not its children's, and the system frees it when the process ends,
+    however it does.
+
+    Args:
+        file: the file; what is in it does not matter.
+        mode: how it is opened; by default it is made where there is none.
+
+    Yields:
+        whether the lock is ours.
+    """
+    with file.open(mode, encoding="utf-8") as handle:
+        ours = lock_descriptor(handle.fileno(), blocking=False)
+        try:
+            yield ours
+        finally:
+            if ours:
+                unlock_descriptor(handle.fileno())
+
+
 class RunDirectory:
     """Files of one run.
 
@@ -130,11 +153,9 @@ class RunDirectory:
                 f"{self.path} is not empty and holds no run; choose another run_dir"
             )
         self.path.mkdir(parents=True, exist_ok=True)
-        with (self.path / ".lock").open("w") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                raise RunDirectoryInUse(f"another process is running in {self.path}") from error
+        with locked(self.path / ".lock") as ours:
+            if not ours:
+                raise RunDirectoryInUse(f"another process is running in {self.path}")
             if not self.config_file.exists():
                 write_atomically(self.path / "versions.json", json.dumps(versions(), indent=2))
             if self._stored().get(_MAY_GROW) != config.get(_MAY_GROW) or not resume:
@@ -159,12 +180,9 @@ class RunDirectory:
         lock = self.path / ".lock"
         if not lock.exists():
             return False
-        with lock.open() as handle:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            except BlockingIOError:
-                return True
-        return False
+        # Nothing is made or changed; a directory may be somebody else's, to be read only.
+        with locked(lock, "r+" if os.access(lock, os.W_OK) else "r") as free:
+            return not free
 
     def check_same(self, config: dict[str, Any]) -> None:
         """Compare ``config`` with that of the run that the directory holds.

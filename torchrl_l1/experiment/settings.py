@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache
-from typing import Any, TypeVar
+from typing import Any, ClassVar
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
@@ -25,7 +25,6 @@ from torchrl_l1.algorithms.metrpo_config import check_clipping
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config
 from torchrl_l1.envs import get_task
-from torchrl_l1.experiment.stages import STAGES
 
 
 @dataclass
@@ -106,7 +105,18 @@ class RunSettings(ABC):
     perturbation: Perturbation = field(default_factory=Perturbation)
     wandb: WandbSettings = field(default_factory=WandbSettings)
 
-    def __post_init__(self) -> None:
+    builds: ClassVar[type[Algorithm]]
+
+    def check(self) -> None:
+        """Refuse settings that could only fail later, the algorithm's own included.
+
+        Whether there is a CUDA device is not asked here: a run that was trained on one may be
+        read anywhere.
+
+        Raises:
+            ValueError: naming the setting.
+        """
+        self.builds.config_class.__post_init__(self)
         fixed = type(self).algorithm
         if self.algorithm != fixed:
             raise ValueError(
@@ -125,16 +135,26 @@ class RunSettings(ABC):
         """Real episodes of so many outer iterations; random data do not count."""
 
     def stages(self) -> tuple[str, ...]:
-        """The stages that ``outer_iterations`` reaches, see :data:`STAGES`."""
-        return STAGES[self.algorithm]
+        """Names of the stages that ``outer_iterations`` reaches."""
+        return self.builds.facts.stage_names
 
-    @abstractmethod
     def build(self) -> Algorithm:
         """The algorithm that the recipe describes, fresh.
 
         Raises:
             ValueError: if settings contradict each other.
         """
+        config = self.builds.config_class
+        return self.builds(
+            self.task,
+            config(**{part.name: getattr(self, part.name) for part in fields(config)}),
+            l1_config(self.l1, self.task),
+            perturbation=self.perturbation,
+            seed=self.seed,
+            horizon=self.horizon,
+            device=self.device,
+            compile_l1=compile_mode(self.l1.compile),
+        )
 
 
 # Keys that may differ between a run and its continuation: they do not touch the result.
@@ -191,9 +211,6 @@ def compile_mode(setting: bool | str) -> CompileMode:
     return setting  # type: ignore[return-value]
 
 
-_Config = TypeVar("_Config")
-
-
 # The algorithm's settings come first: they say how many outer iterations there are.
 @dataclass
 class METRPORecipe(METRPOConfig, RunSettings):
@@ -205,17 +222,13 @@ class METRPORecipe(METRPOConfig, RunSettings):
 
     algorithm: str = "metrpo"
     published_horizon: int = 1000
+    builds: ClassVar[type[Algorithm]] = METRPO
 
     def __post_init__(self) -> None:
-        RunSettings.__post_init__(self)
-        METRPOConfig.__post_init__(self)
+        self.check()
         check_clipping(self.clip_actions, self.l1.enabled)
         if self.published_horizon < 1:
             raise ValueError(f"published_horizon must be at least 1, got {self.published_horizon}")
-
-    def build(self) -> METRPO:
-        """The algorithm, fresh."""
-        return METRPO(self.task, _part(self, METRPOConfig), **_surroundings(self))
 
 
 @dataclass
@@ -226,14 +239,10 @@ class PETSRecipe(PETSConfig, RunSettings):
     """
 
     algorithm: str = "pets"
+    builds: ClassVar[type[Algorithm]] = PETS
 
     def __post_init__(self) -> None:
-        RunSettings.__post_init__(self)
-        PETSConfig.__post_init__(self)
-
-    def build(self) -> PETS:
-        """The algorithm, fresh."""
-        return PETS(self.task, _part(self, PETSConfig), **_surroundings(self))
+        self.check()
 
 
 @dataclass
@@ -241,14 +250,10 @@ class MBMFRecipe(MBMFConfig, RunSettings):
     """An MBMF recipe: run settings and the algorithm's own, side by side."""
 
     algorithm: str = "mbmf"
+    builds: ClassVar[type[Algorithm]] = MBMF
 
     def __post_init__(self) -> None:
-        RunSettings.__post_init__(self)
-        MBMFConfig.__post_init__(self)
-
-    def build(self) -> MBMF:
-        """The algorithm, fresh."""
-        return MBMF(self.task, _part(self, MBMFConfig), **_surroundings(self))
+        self.check()
 
 
 SCHEMAS: dict[str, type[RunSettings]] = {
@@ -286,20 +291,3 @@ def schema_defaults(config: Mapping[str, Any]) -> Mapping[str, Any]:
 def _defaults(algorithm: str) -> Mapping[str, Any]:
     node = OmegaConf.to_container(OmegaConf.structured(SCHEMAS[algorithm]))
     return {key: value for key, value in flatten(node).items() if value != MISSING}
-
-
-def _part(recipe: RunSettings, config: type[_Config]) -> _Config:
-    """The algorithm's part of a recipe."""
-    return config(**{f.name: getattr(recipe, f.name) for f in fields(config)})  # type: ignore[arg-type]
-
-
-def _surroundings(recipe: RunSettings) -> dict[str, Any]:
-    """What every algorithm takes beside its own settings."""
-    return {
-        "l1": l1_config(recipe.l1, recipe.task),
-        "perturbation": recipe.perturbation,
-        "seed": recipe.seed,
-        "horizon": recipe.horizon,
-        "device": recipe.device,
-        "compile_l1": compile_mode(recipe.l1.compile),
-    }

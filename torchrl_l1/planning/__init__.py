@@ -7,13 +7,14 @@ from torchrl_l1.planning.compiled_motion import resolve_compilation
 from torchrl_l1.planning.mppi import MPPIConfig
 from torchrl_l1.planning.mppi import plan as plan_mppi
 from torchrl_l1.planning.particles import Propagation
-from torchrl_l1.planning.planner import ModelPredictiveController
+from torchrl_l1.planning.planner import PLAN_KEY, ModelPredictiveController
 from torchrl_l1.planning.random_shooting import ShootingConfig
 from torchrl_l1.planning.random_shooting import plan as plan_shooting
 from torchrl_l1.planning.sequences import Evaluate, Plan
 from torchrl_l1.planning.trajectory_sampling import TrajectorySampler, check_sampling, evaluate
 
 __all__ = [
+    "PLAN_KEY",
     "CEMConfig",
     "Evaluate",
     "MPPIConfig",

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from torchrl_l1.report.build import report
-from torchrl_l1.report.finding import find_runs
-from torchrl_l1.report.published import PublishedCell, published_cell, published_cells
-from torchrl_l1.report.reference_curves import Curves, ReferenceCurves
-from torchrl_l1.report.runs import Evaluation, Run
-from torchrl_l1.report.variants import Cell, Study
+from torchrl_l1.report.evaluation_data import Evaluation
+from torchrl_l1.report.published import (
+    Curves,
+    PublishedCell,
+    ReferenceCurves,
+    published_cell,
+    published_cells,
+)
+from torchrl_l1.report.runs import Run, find_runs
+from torchrl_l1.report.study import Cell, Study
 
 __all__ = [
     "Cell",

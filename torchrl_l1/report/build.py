@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
+import argparse
+import math
+import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torchrl_l1.campaign.description import load_yaml, read_campaign
+from torchrl_l1.experiment.recipes import available_campaigns
 from torchrl_l1.experiment.run_directory import write_atomically
-from torchrl_l1.report.algorithm_sections import algorithm_sections
-from torchrl_l1.report.campaigns import find_campaigns
-from torchrl_l1.report.evaluation_sections import evaluation_sections
-from torchrl_l1.report.finding import Findings, find_readable_runs
-from torchrl_l1.report.page import Page
-from torchrl_l1.report.reference_curves import ReferenceCurves
-from torchrl_l1.report.training_sections import training_sections
-from torchrl_l1.report.training_tables import run_rows
-from torchrl_l1.report.variants import Study, studies
+from torchrl_l1.report.comparison import algorithm_sections
+from torchrl_l1.report.evaluations import evaluation_sections
+from torchrl_l1.report.page import Page, markdown
+from torchrl_l1.report.published import ReferenceCurves
+from torchrl_l1.report.runs import Findings, Run, find_readable_runs
+from torchrl_l1.report.study import Study, studies
+from torchrl_l1.report.training import run_rows, training_sections
+
+
+def report_command(options: argparse.Namespace) -> None:
+    """Write the report and say where it is."""
+    page = report(
+        list(dict.fromkeys(map(Path, options.dir))),
+        Path(options.output) if options.output else None,
+        Path(options.reference_curves) if options.reference_curves else None,
+    )
+    print(f"Report: {page}")
+    print(f"Tables (.csv) and figures (.png): {page.parent}")
 
 
 def report(
@@ -56,14 +71,13 @@ def report(
 
     page = Page(output)
     _introduction(page, every, found, _command(folders, output, reference_curves))
-    page.campaigns(campaigns)
+    _campaigns(page, campaigns)
     for study in every:
         part = page.part(study.facts.name) if len(every) > 1 else page
         training_sections(part, study, reference)
         evaluation_sections(part, study)
     algorithm_sections(page, every)
-    page.heading("Versions", "What the runs ran with, from their `versions.json`.")
-    page.versions(runs)
+    _versions(page, runs)
     file = output / "report.md"
     write_atomically(file, page.render())
     return file
@@ -117,3 +131,97 @@ def _command(folders: Sequence[Path], output: Path, reference_curves: Path | Non
     if reference_curves is not None:
         words.append(f"--reference-curves {reference_curves}")
     return " ".join(words)
+
+
+@dataclass(frozen=True)
+class CampaignState:
+    """A campaign and how far it is.
+
+    Attributes:
+        name: its name.
+        description: one line.
+        command: what makes it, or makes it complete.
+        expected: number of runs that it asks for.
+        finished: number of finished ones.
+        begun: number of those that are not finished.
+    """
+
+    name: str
+    description: str
+    command: str
+    expected: int
+    finished: int
+    begun: int
+
+
+def find_campaigns(folders: Sequence[Path], runs: Sequence[Run]) -> list[CampaignState]:
+    """Every ``campaign.yaml`` in or below some folders.
+
+    Raises:
+        ValueError: if one of them is no campaign file.
+    """
+    found: dict[Path, CampaignState] = {}
+    for folder in folders:
+        for path, below, files in os.walk(folder):
+            inside_a_run = "config.yaml" in files
+            below[:] = sorted(n for n in below if not (n.startswith(".") or inside_a_run))
+            if "campaign.yaml" in files and Path(path).resolve() not in found:
+                found[Path(path).resolve()] = _read_campaign(Path(path), runs)
+    return list(found.values())
+
+
+def _read_campaign(folder: Path, runs: Sequence[Run]) -> CampaignState:
+    file = folder / "campaign.yaml"
+    content = load_yaml(file)
+    try:
+        name = str(content.get("name", folder.name))
+        matrices = [entry["matrix"] for entry in content["runs"]]
+        expected = sum(math.prod(map(len, matrix.values())) for matrix in matrices)
+    except (AttributeError, KeyError, TypeError) as error:
+        raise ValueError(f"{file} is no campaign file: {error!r}") from error
+    given: str | Path = file
+    if name in available_campaigns():
+        # The file in the folder has the overrides of its command; the shipped one has none.
+        same = read_campaign(name).to_dict()["runs"] == content["runs"]
+        given = name if same else file
+    mine = [run for run in runs if run.path.resolve().is_relative_to(folder.resolve())]
+    return CampaignState(
+        name,
+        str(content.get("description", "")),
+        f"torchrl-l1 campaign {given} --output {folder}",
+        expected,
+        sum(run.finished for run in mine),
+        sum(not run.finished for run in mine),
+    )
+
+
+def _campaigns(page: Page, campaigns: Sequence[CampaignState]) -> None:
+    """How far each campaign is, and the command behind it."""
+    for campaign in campaigns:
+        left = campaign.expected - campaign.finished - campaign.begun
+        state = f"{campaign.finished} of {campaign.expected} runs finished"
+        state += f", {campaign.begun} unfinished" * (campaign.begun > 0)
+        state += f", {left} not begun" * (left > 0)
+        page.text(
+            f"Campaign **{campaign.name}** ({state}). {campaign.description}".strip(),
+            f"```console\n$ {campaign.command}\n```",
+        )
+
+
+def _versions(page: Page, runs: Sequence[Run]) -> None:
+    """What the runs ran with, a line per package and version."""
+    page.heading("Versions", "What the runs ran with, from their `versions.json`.")
+    seen: dict[tuple[str, str], int] = {}
+    for run in runs:
+        for package, version in run.versions.items():
+            seen[package, version] = seen.get((package, version), 0) + 1
+    rows = [
+        {"package": package, "version": version, "runs": str(count)}
+        for (package, version), count in sorted(seen.items())
+    ]
+    without = sum(not run.versions for run in runs)
+    if rows:
+        page.text(markdown(rows))
+        page.csv("versions", rows)
+    if without:
+        page.text(f"{without} of {len(runs)} runs have no versions.json.")

@@ -1,16 +1,21 @@
-"""Ablation bars and disturbance charts."""
+"""Ablation bars, returns against disturbances, and sweeps of the controller's values."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import NullLocator
 
-from torchrl_l1.report.algorithms import AlgorithmFacts
-from torchrl_l1.report.evaluation_tables import PHASES
+from torchrl_l1.algorithms.facts import AlgorithmFacts
+from torchrl_l1.envs import DISTURBANCES
+from torchrl_l1.experiment.l1_options import controller_label
+from torchrl_l1.report.identity import BASELINE
+from torchrl_l1.report.study import noise_order
 from torchrl_l1.report.style import (
     arm_label,
     color,
@@ -21,16 +26,26 @@ from torchrl_l1.report.style import (
     save,
     title,
 )
-from torchrl_l1.report.variants import noise_order
 
 Row = Mapping[str, Any]
+
+PHASES = ("neither", "training only", "testing only", "both")
+"""Where L1 is on, in the order in which tables and figures show it."""
+
+_AXES = {
+    "epsilon": "switching tolerance epsilon (raw state units)",
+    "alpha": "filter gain alpha per step",
+}
+# The first colour is that of the line without L1.
+_COLORS = 6
+_MARKERS = "osD^vP"
 
 
 def plot_ablation(rows: Sequence[Row], file: Path, name: str = "") -> Path:
     """Bars of return with L1 in neither phase, one of them, or both; a panel per task.
 
     Args:
-        rows: of :func:`~torchrl_l1.report.evaluation_tables.ablation_rows`, of one kind of policy,
+        rows: of :func:`~torchrl_l1.report.evaluations.ablation_rows`, of one kind of policy,
             one kind of L1, one variant and one stage.
         file: where to.
         name: of the algorithm, where there are several.
@@ -68,57 +83,110 @@ def _bar(axis: Axes, x: float, row: Row, shade: str) -> None:
         axis.vlines(x, row["return_low"], row["return_high"], color="black", linewidth=1.4)
 
 
-def plot_disturbances(
-    rows: Sequence[Row], heading: str, file: Path, algorithm: AlgorithmFacts
-) -> Path | None:
-    """Return against actuator bias and against actuator gain, and what L1 adds to it.
+@dataclass(frozen=True)
+class Columns:
+    """What a chart shows against a disturbance: columns of rows, as a line within a band.
 
-    The band of a return is the 95 % interval of the mean over training seeds. These differ more
-    from each other than L1 off from L1 on, so below each return stands the difference, policy by
-    policy, with the interval of its own mean.
+    Attributes:
+        line: the values.
+        low: lower limits of the band, as far as there are any.
+        high: upper ones.
+        words: at the axis.
+    """
+
+    line: str
+    low: str
+    high: str
+    words: str
+
+
+MEANS = Columns("return_mean", "return_low", "return_high", "return (sum of rewards)")
+"""Means over training seeds with their 95 % intervals."""
+
+DIFFERENCES = Columns(
+    "difference_mean", "difference_low", "difference_high", "return, less that with L1 off"
+)
+"""Mean differences to the same policies without L1, with their 95 % intervals."""
+
+RANGES = Columns("return_median", "return_lowest", "return_highest", "return (sum of rewards)")
+"""Medians over training seeds, from the lowest to the highest."""
+
+
+def plot_disturbances(
+    rows: Sequence[Row],
+    heading: str,
+    file: Path,
+    algorithm: AlgorithmFacts,
+    shown: Sequence[Columns] = (MEANS, DIFFERENCES),
+    always: bool = False,
+) -> Path | None:
+    """Return against each disturbance, one line per controller.
+
+    There is a panel per stage, policy, noise and disturbance. The band of a return is the 95 %
+    interval of the mean over training seeds. These differ more from each other than L1 off from
+    L1 on, so below each return stands the difference, policy by policy, with the interval of its
+    own mean.
 
     Args:
-        rows: of one cell and stage of the training, tested under several biases and gains.
+        rows: tested under several values of disturbances; in a report, of one cell and stage of
+            the training.
         heading: title of the figure.
         file: where to.
         algorithm: what the policies are of.
+        shown: what the panels show, the first being returns.
+        always: whether to draw the first disturbance where none varies.
 
     Returns:
-        the file, or ``None`` if neither bias nor gain varies.
+        the file, or ``None`` if there is nothing to draw.
     """
     found: list[tuple[str, str, list[Row]]] = []
-    stage = rows[0].get("stage", "")
-    for policy, noise in dict.fromkeys((row["policy"], row["noise"]) for row in rows):
-        mine = [row for row in rows if (row["policy"], row["noise"]) == (policy, noise)]
-        for what, other, neutral in (("bias", "gain", 1.0), ("gain", "bias", 0.0)):
-            chosen = [row for row in mine if row[other] == neutral]
-            if len({row[what] for row in chosen}) > 1:
-                name = _panel_title(algorithm.acting(policy, stage), noise)
-                found.append((name, what, chosen))
+    for stage, policy, noise in dict.fromkeys(map(_tested, rows)):
+        mine = [row for row in rows if _tested(row) == (stage, policy, noise)]
+        varied = _varied(mine)
+        if not varied and always:
+            varied = {next(iter(DISTURBANCES)): mine}
+        name = _panel_title(algorithm.acting(policy, stage), noise)
+        found += [(name, what, chosen) for what, chosen in varied.items()]
     if not found:
         return None
     # All panels of a column vary the same; returns and differences take turns down the rows.
-    columns = len({what for _, what, _ in found})
+    # A single disturbance with nothing below it has room for two beside each other.
+    columns = max(len({what for _, what, _ in found}), 2 // len(shown))
     groups = [found[i : i + columns] for i in range(0, len(found), columns)]
     panels = [
         (name, what, chosen, value)
         for group in groups
-        for value in ("return", "difference")
+        for value in shown
         for name, what, chosen in group
-        if any(f"{value}_mean" in row for row in chosen)
+        if any(value.line in row for row in chosen)
     ]
     figure, axes = grid(len(panels), columns=columns, width=5.2, height=3.2)
-    shown: list[Sequence[float]] = []
+    scaled: list[Sequence[float]] = []
     for axis, (name, what, chosen, value) in zip(axes, panels, strict=True):
         drawn = _draw_disturbance(axis, what, chosen, value)
         axis.set_title(name, fontsize=10)
-        if value == "return":
-            shown += drawn
-    returns = [axis for axis, panel in zip(axes, panels, strict=True) if panel[-1] == "return"]
-    fit_scale(returns, shown)
+        if value is shown[0]:
+            scaled += drawn
+    returns = [axis for axis, panel in zip(axes, panels, strict=True) if panel[-1] is shown[0]]
+    fit_scale(returns, scaled)
     figure.suptitle(heading, fontsize=11)
     legend_below(figure, axes)
     return save(figure, file)
+
+
+def _tested(row: Row) -> tuple[str, str, str]:
+    return row.get("stage", ""), row["policy"], row["noise"]
+
+
+def _varied(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """By name of a disturbance that varies, the rows in which all others are neutral."""
+    found = {}
+    for what in DISTURBANCES:
+        others = [(name, entry.neutral) for name, entry in DISTURBANCES.items() if name != what]
+        chosen = [row for row in rows if all(row[name] == value for name, value in others)]
+        if len({row[what] for row in chosen}) > 1:
+            found[what] = chosen
+    return found
 
 
 def _panel_title(actions: str, noise: str) -> str:
@@ -127,35 +195,34 @@ def _panel_title(actions: str, noise: str) -> str:
 
 
 def _draw_disturbance(
-    axis: Axes, what: str, rows: Sequence[Row], value: str
+    axis: Axes, what: str, rows: Sequence[Row], value: Columns
 ) -> list[Sequence[float]]:
     """Draw a panel of returns or differences; returns its values and lower limits."""
     shown: list[Sequence[float]] = []
     for index, tested in enumerate(dict.fromkeys(row["l1"] for row in rows)):
-        mine = [row for row in rows if row["l1"] == tested and f"{value}_mean" in row]
+        mine = [row for row in rows if row["l1"] == tested and value.line in row]
         if not mine:
             continue
         line = sorted(mine, key=lambda row: row[what])
         shade = color(3 + index, tested)
-        means = [row[f"{value}_mean"] for row in line]
+        values = [row[value.line] for row in line]
         axis.plot(
-            [row[what] for row in line], means, "o-", color=shade, markersize=4,
+            [row[what] for row in line], values, "o-", color=shade, markersize=4,
             label=arm_label(tested),
         )  # fmt: skip
-        shown.append(means)
-        limits = [row for row in line if row.get(f"{value}_low") is not None]
+        shown.append(values)
+        limits = [row for row in line if row.get(value.low) is not None]
         if limits:
-            low, high = ([row[f"{value}_{side}"] for row in limits] for side in ("low", "high"))
+            low, high = ([row[side] for row in limits] for side in (value.low, value.high))
             axis.fill_between(
                 [row[what] for row in limits], low, high, color=shade, alpha=0.18, linewidth=0
             )
             # Not the upper limit: it may lie beyond what a return can be.
             shown.append(low)
-    axis.set_xlabel(f"actuator {what} ({'action units' if what == 'bias' else 'factor'})")
-    if value == "return":
-        axis.set_ylabel("return (sum of rewards)")
-    else:
-        axis.set_ylabel("return, less that with L1 off")
+    disturbance = DISTURBANCES[what]
+    axis.set_xlabel(f"{disturbance.words} ({disturbance.units})")
+    axis.set_ylabel(value.words)
+    if value is DIFFERENCES:
         axis.axhline(0, color="black", linewidth=0.8)
     axis.grid(alpha=0.3)
     return shown
@@ -163,3 +230,150 @@ def _draw_disturbance(
 
 def _values(row: Row) -> list[float]:
     return [float(value) for value in str(row["return_values"]).split()]
+
+
+def tuning_rows(rows: Sequence[Row]) -> tuple[str, list[Row]]:
+    """The kind of policy that a figure shows, and its rows: sampled actions where there are any.
+
+    Training samples its actions, and the mean action alone hardly moves the operating point.
+
+    Args:
+        rows: of one cell of the training.
+    """
+    tuned = {row["policy"] for row in rows if "option" in row}
+    policy = "deterministic" if tuned == {"deterministic"} else "stochastic"
+    return policy, [row for row in rows if row["policy"] == policy]
+
+
+def plot_tuning(rows: Sequence[Row], heading: str, file: Path) -> Path | None:
+    """Switches per 1000 steps and returns against epsilon, one line per alpha.
+
+    The panel of the switches is that of the first condition, the least disturbed one; then each
+    condition has a panel with its returns: means over training seeds, their 95 % intervals as
+    bars, and the return without L1 as a dashed line. If only alpha varies, it takes the place of
+    epsilon.
+
+    Args:
+        rows: of :func:`tuning_rows`.
+        heading: title of the figure.
+        file: where to.
+
+    Returns:
+        the file, or ``None`` if neither epsilon nor alpha varies.
+    """
+    tuned = [row for row in rows if "option" in row]
+    values = {key: {row[key] for row in tuned} - {None} for key in _AXES}
+    x, other = ("alpha", "epsilon") if len(values["epsilon"]) < 2 else ("epsilon", "alpha")
+    if len(values[x]) < 2:
+        return None
+    tuned = [row for row in tuned if row[x] is not None]
+    found = sorted(
+        set(map(_condition, tuned)), key=lambda cell: (noise_order(cell[0]), *_distance(cell[1:]))
+    )
+    lines = _lines(tuned, other)
+    first = [row for row in tuned if _condition(row) == found[0]]
+    with_switches = any("switches_per_1000_steps" in row for row in first)
+    figure, axes = grid(len(found) + with_switches, columns=3, width=4.4, height=3.5)
+    if with_switches:
+        _draw(axes[0], first, lines, x, "switches_per_1000_steps")
+        axes[0].set_ylabel("switches per 1000 steps")
+        axes[0].set_title(f"switches, {_words(found[0])}", fontsize=10)
+        top = max(1.0, axes[0].get_ylim()[1])
+        axes[0].set_ylim(-0.03 * top, top)
+    for axis, condition in zip(axes[with_switches:], found, strict=True):
+        shown = [row for row in tuned if _condition(row) == condition]
+        off = [r for r in rows if r["l1"] == BASELINE and _condition(r) == condition]
+        _draw(axis, shown, lines, x, "return_mean")
+        for row in off:
+            axis.axhline(
+                row["return_mean"], color=color(0, BASELINE), linestyle="--",
+                label=arm_label(BASELINE),
+            )  # fmt: skip
+        # Of the means: intervals of a few seeds reach above the best return that there can be.
+        fit_scale([axis], [[row["return_mean"] for row in [*shown, *off]]])
+        axis.set_ylabel("return (sum of rewards)")
+        axis.set_title(f"return, {_words(condition)}", fontsize=10)
+    for axis in axes:
+        axis.set_xscale("log")
+        ticks = sorted(values[x])
+        axis.set_xticks(ticks, [f"{value:g}" for value in ticks])
+        axis.xaxis.set_minor_locator(NullLocator())
+        axis.set_xlabel(_AXES[x])
+        axis.grid(alpha=0.3)
+    figure.suptitle(heading, fontsize=11)
+    legend_below(figure, axes, last=[arm_label(BASELINE)])
+    return save(figure, file)
+
+
+def _lines(rows: Sequence[Row], other: str) -> dict[tuple[str, float | None], str]:
+    """Label of each line by option and the value that is not on the axis, in order."""
+    keys = {(row["option"], row[other]) for row in rows}
+    ordered = sorted(keys, key=lambda key: (key[0], key[1] is not None, key[1] or 0.0))
+    return {
+        (option, value): arm_label(controller_label(option, **{other: value}))
+        for option, value in ordered
+    }
+
+
+def _draw(
+    axis: Axes,
+    rows: Sequence[Row],
+    lines: Mapping[tuple[str, float | None], str],
+    x: str,
+    y: str,
+) -> None:
+    other = "alpha" if x == "epsilon" else "epsilon"
+    ticks = np.unique([row[x] for row in rows])
+    # Side by side, so that intervals do not hide each other; switches have none.
+    widest = 0.25 * np.diff(np.log(ticks)).min(initial=1.0) / max(len(lines) - 1, 1)
+    step = min(widest, 0.07) * (y == "return_mean")
+    for index, (line, label) in enumerate(lines.items()):
+        mine = [row for row in rows if (row["option"], row[other]) == line and y in row]
+        mine.sort(key=lambda row: row[x])
+        shade = color(1 + index % _COLORS)
+        marker = _MARKERS[index % len(_MARKERS)]
+        aside = np.exp(step * (index - (len(lines) - 1) / 2))
+        axis.plot(
+            [aside * row[x] for row in mine],
+            [row[y] for row in mine],
+            f"{marker}-",
+            color=shade,
+            ms=4,
+            label=label,
+        )
+        limits = [row for row in mine if y == "return_mean" and "return_low" in row]
+        axis.vlines(
+            [aside * row[x] for row in limits],
+            [row["return_low"] for row in limits],
+            [row["return_high"] for row in limits],
+            color=shade,
+            alpha=0.6,
+        )
+
+
+def _condition(row: Row) -> tuple[Any, ...]:
+    return row["noise"], *(row[name] for name in DISTURBANCES)
+
+
+def _distance(disturbances: Sequence[float]) -> tuple[float, ...]:
+    """By the last disturbance first, how far each is from neutral."""
+    pairs = zip(disturbances, DISTURBANCES.values(), strict=True)
+    found = [(abs(value - entry.neutral), value) for value, entry in pairs]
+    return tuple(number for pair in reversed(found) for number in pair)
+
+
+def _words(condition: tuple[Any, ...]) -> str:
+    """A condition in the title of a panel.
+
+    Examples:
+        >>> _words(("none", 1.0, 1.0)), _words(("action", 0.0, 0.6)), _words(("none", 0.0, 1.0))
+        ('bias 1', 'noise: action, gain 0.6', 'undisturbed')
+    """
+    noise, *values = condition
+    words = [f"noise: {noise}"] * (noise != "none")
+    words += [
+        f"{name} {value:g}"
+        for (name, entry), value in zip(DISTURBANCES.items(), values, strict=True)
+        if value != entry.neutral
+    ]
+    return ", ".join(words) or "undisturbed"

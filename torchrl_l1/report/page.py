@@ -1,17 +1,15 @@
-"""The report itself: sections of text, tables and figures."""
+"""The page of a report, and the tables in it."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from torchrl_l1.experiment.run_directory import write_table
-from torchrl_l1.report.campaigns import CampaignState
-from torchrl_l1.report.runs import Run
 from torchrl_l1.report.style import named
-from torchrl_l1.report.tables import markdown
 
 Row = Mapping[str, Any]
 
@@ -66,35 +64,6 @@ class Page:
         if file is not None:
             self.text(f"![{named(self.name, caption)}]({file.name})")
 
-    def campaigns(self, campaigns: Sequence[CampaignState]) -> None:
-        """How far each campaign is, and the command behind it."""
-        for campaign in campaigns:
-            left = campaign.expected - campaign.finished - campaign.begun
-            state = f"{campaign.finished} of {campaign.expected} runs finished"
-            state += f", {campaign.begun} unfinished" * (campaign.begun > 0)
-            state += f", {left} not begun" * (left > 0)
-            self.text(
-                f"Campaign **{campaign.name}** ({state}). {campaign.description}".strip(),
-                f"```console\n$ {campaign.command}\n```",
-            )
-
-    def versions(self, runs: Sequence[Run]) -> None:
-        """What the runs ran with, a line per package and version."""
-        seen: dict[tuple[str, str], int] = {}
-        for run in runs:
-            for package, version in run.versions.items():
-                seen[package, version] = seen.get((package, version), 0) + 1
-        rows = [
-            {"package": package, "version": version, "runs": str(count)}
-            for (package, version), count in sorted(seen.items())
-        ]
-        without = sum(not run.versions for run in runs)
-        if rows:
-            self.text(markdown(rows))
-            self.csv("versions", rows)
-        if without:
-            self.text(f"{without} of {len(runs)} runs have no versions.json.")
-
     def render(self) -> str:
         """The Markdown."""
         return "\n\n".join(self._blocks) + "\n"
@@ -108,3 +77,122 @@ def slug(words: Sequence[str]) -> str:
         'half_cheetah_l1_epsilon_0_1'
     """
     return re.sub(r"[^A-Za-z0-9]+", "_", "_".join(filter(None, words))).strip("_").lower()
+
+
+def markdown(rows: Sequence[Mapping[str, str]]) -> str:
+    """A Markdown table; the keys of the rows are its header. Columns without content go.
+
+    Without rows it is empty.
+    """
+    if not rows:
+        return ""
+    columns = [key for key in rows[0] if any(row[key] not in ("", "–") for row in rows)]
+    lines = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
+    lines += [f"| {' | '.join(row[key] for key in columns)} |" for row in rows]
+    return "\n".join(lines)
+
+
+class Footnotes:
+    """Numbered notes below a table; equal ones share their number."""
+
+    def __init__(self) -> None:
+        self._notes: dict[str, int] = {}
+
+    def mark(self, note: str) -> str:
+        """The mark of a note, such as ``†1``; nothing for an empty one."""
+        return f" †{self._notes.setdefault(note, len(self._notes) + 1)}" if note else ""
+
+    def below(self, table: str) -> str:
+        """A table with the notes under it, a line each."""
+        notes = "\n".join(f"- †{index}: {note}." for note, index in self._notes.items())
+        return f"{table}\n\n{notes}".rstrip()
+
+
+def number(value: float | None) -> str:
+    """Three significant digits, and no fewer than the units.
+
+    Examples:
+        >>> number(2367.31), number(-51.26), number(-0.00312), number(None)
+        ('2367', '-51.3', '-0.00312', '–')
+    """
+    if value is None or math.isnan(value):
+        return "–"
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def interval_text(row: Row, name: str) -> str:
+    """The interval of a value, or a dash.
+
+    Examples:
+        >>> interval_text({"return_low": -1.0, "return_high": 2.5}, "return")
+        '[-1, 2.5]'
+        >>> interval_text({}, "return")
+        '–'
+    """
+    low, high = row.get(f"{name}_low"), row.get(f"{name}_high")
+    return "–" if low is None else f"[{number(low)}, {number(high)}]"
+
+
+def spread_text(mean: float | None, spread: float | None) -> str:
+    """A mean with its spread, if it has one.
+
+    Examples:
+        >>> spread_text(2367.31, 12.0), spread_text(2367.31, None), spread_text(None, None)
+        ('2367 ± 12', '2367', '–')
+    """
+    return number(mean) if spread is None else f"{number(mean)} ± {number(spread)}"
+
+
+def return_text(row: Row | None) -> str:
+    """The return of some seeds: mean, standard deviation and interval, as far as there are any."""
+    if row is None:
+        return "–"
+    seeds = row["seeds"] if "seeds" in row else row["training_seeds"]
+    spread = spread_text(row["return_mean"], row["std"] if seeds > 1 else None)
+    return f"{spread} {interval_text(row, 'return')}".removesuffix(" –")
+
+
+def difference_text(row: Row) -> str:
+    """A mean difference with its interval, or the differences where there are few."""
+    if row.get("difference_low") is None:
+        return _differences(row) or "–"
+    return f"{number(row['difference_mean'])} {interval_text(row, 'difference')}"
+
+
+def difference_columns(row: Row) -> dict[str, str]:
+    """The same with the interquartile mean, as columns."""
+    few = row.get("difference_low") is None
+    return {
+        "mean difference": "–" if few else number(row["difference_mean"]),
+        "95 % interval": interval_text(row, "difference"),
+        "interquartile mean": number(row.get("iqm")),
+        "95 % interval of it": interval_text(row, "iqm"),
+        "differences": _differences(row) if few else "",
+    }
+
+
+def _differences(row: Row) -> str:
+    return ", ".join(number(float(value)) for value in str(row.get("differences", "")).split())
+
+
+def paper_text(row: Row, notes: Footnotes) -> str:
+    """What the paper prints, with a mark where that is not to be taken at its word."""
+    if row.get("paper_mean") is None:
+        return "–"
+    return f"{row['paper_mean']} ± {row['paper_std']}{notes.mark(row['paper_erratum'])}"
+
+
+def grouped(
+    rows: Sequence[Row], keys: Sequence[str], inner: str
+) -> list[tuple[tuple[Any, ...], dict[str, Row]]]:
+    """The rows that agree in some keys, each group by the value of another key.
+
+    Args:
+        rows: the rows.
+        keys: what a group has in common; empty where a row lacks it.
+        inner: what sets its rows apart.
+    """
+    groups: dict[tuple[Any, ...], dict[str, Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row.get(key, "") for key in keys), {})[row[inner]] = row
+    return list(groups.items())

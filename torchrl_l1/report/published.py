@@ -1,4 +1,4 @@
-"""The paper's printed tables, with what is known to be wrong with their cells."""
+"""The paper's printed tables, with what is wrong with their cells, and its authors' curves."""
 
 from __future__ import annotations
 
@@ -6,12 +6,31 @@ import csv
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 
-from torchrl_l1.report.algorithms import facts
-from torchrl_l1.report.settings import BASELINE
+import numpy as np
+
+from torchrl_l1.report.identity import BASELINE, facts
+from torchrl_l1.report.reading import numeric_rows
 
 # Controllers whose results the paper's "L1" stands for: its own and that of its released code.
 _PUBLISHED_ARMS = ("paper", "reference")
+
+
+CURVE_COLUMNS = ("arm", "setting", "seed", "iteration", "total_train_samples", "average_return")
+
+_TASKS = {
+    "Inverted_Pendulum": "inverted_pendulum",
+    "Swimmer": "swimmer",
+    "Hopper": "hopper",
+    "Walker": "walker",
+    "Halfcheetah": "half_cheetah",
+}
+_NOISES = {"": "none", "_Action_Noise": "action", "_Observation_Noise": "observation"}
+_FORMS = {"_nl": "nonlinear", "_ca": "affine"}
+
+# The authors hold a third of the data out of the fit and log the size of the rest.
+_STEPS_PER_TRAINING_SAMPLE = 1.5
 
 
 @dataclass(frozen=True)
@@ -72,7 +91,7 @@ def published_cell(
         trained: L1 setting of the training.
         testing_noise: noise of the test; that of the training in a run's own returns.
         tested: L1 setting of the test.
-        algorithm: see :data:`~torchrl_l1.report.algorithms.ALGORITHMS`. Of MBMF there are only the
+        algorithm: see :data:`~torchrl_l1.report.identity.ALGORITHMS`. Of MBMF there are only the
             returns of the training.
 
     Examples:
@@ -96,3 +115,63 @@ def published_cell(
         kind = "sim_to_real" if training_noise == "none" else ""
     table = facts(algorithm).tables.get(kind, "")
     return published_cells().get((table, task, testing_noise, switches[0], switches[1]))
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Real steps and mean returns ``(seeds, T)`` of one setting."""
+
+    real_steps: np.ndarray
+    returns: np.ndarray
+
+
+class ReferenceCurves:
+    """The authors' curves, in the layout of their parsed logs.
+
+    The CSV has one row per outer iteration and run, with the columns ``arm`` (``L1_OFF``,
+    ``L1_ON``, or ``nl_vs_ca`` for the comparison of nonlinear and control-affine models),
+    ``setting`` (``Halfcheetah``, ``Halfcheetah_Action_Noise``, ``Halfcheetah_ca``, ...),
+    ``seed``, ``iteration``, ``total_train_samples`` (two thirds of the real steps) and
+    ``average_return``. Other columns are left alone.
+
+    Args:
+        path: the file.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if a column is missing, a value is empty or no number, a setting is unknown,
+            or the seeds of a setting differ in length.
+    """
+
+    def __init__(self, path: Path) -> None:
+        if not path.is_file():
+            raise FileNotFoundError(f"no reference curves at {path}")
+        runs: dict[tuple[str, str], dict[str, list[tuple[float, float]]]] = {}
+        for row in numeric_rows(path, CURVE_COLUMNS[-2:], CURVE_COLUMNS[:-2]):
+            seeds = runs.setdefault((row["arm"], row["setting"]), {})
+            steps = row["total_train_samples"] * _STEPS_PER_TRAINING_SAMPLE
+            seeds.setdefault(row["seed"], []).append((steps, row["average_return"]))
+        self._curves: dict[tuple[str, str, bool, str], Curves] = {}
+        for (arm, setting), seeds in runs.items():
+            if len({len(points) for points in seeds.values()}) != 1:
+                raise ValueError(f"{path}: the seeds of {arm} {setting} differ in length")
+            data = np.array(list(seeds.values()))
+            self._curves[_meaning(path, arm, setting)] = Curves(data[..., 0], data[..., 1])
+
+    def training(self, task: str, noise: str, arm: str) -> Curves | None:
+        """The curves of a task, noise and arm (anything but ``off`` is with L1)."""
+        return self._curves.get((task, noise, arm != BASELINE, ""))
+
+    def model_form(self, task: str, form: str) -> Curves | None:
+        """The curves behind figure 2, ``nonlinear`` or ``affine``."""
+        return self._curves.get((task, "none", False, form))
+
+
+def _meaning(path: Path, arm: str, setting: str) -> tuple[str, str, bool, str]:
+    for name, task in _TASKS.items():
+        rest = setting.removeprefix(name)
+        if setting.startswith(name) and arm in ("L1_OFF", "L1_ON") and rest in _NOISES:
+            return task, _NOISES[rest], arm == "L1_ON", ""
+        if setting.startswith(name) and arm == "nl_vs_ca" and rest in _FORMS:
+            return task, "none", False, _FORMS[rest]
+    raise ValueError(f"{path}: unknown arm and setting {arm!r}, {setting!r}")

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import bootstrap, t, trim_mean
 
-WINDOW = 3
-"""Outer iterations at the end of a run that its return is the mean of, as in the paper."""
+from torchrl_l1.algorithms.facts import WINDOW
 
 MIN_SAMPLES = 3
 """With fewer values than this there is no interval: the values themselves say more."""
@@ -114,6 +113,28 @@ def interquartile_interval(values: Sequence[float]) -> Interval | None:
     if len(values) < MIN_INTERQUARTILE:
         return None
     return _bootstrap(values, interquartile_mean, "percentile")
+
+
+def mean_summary(name: str, values: Sequence[float]) -> dict[str, Any]:
+    """Mean and, of three values or more, its interval."""
+    result = {f"{name}_mean": float(np.mean(values))}
+    interval = mean_interval(values)
+    if interval is not None:
+        result |= {f"{name}_low": interval.low, f"{name}_high": interval.high}
+    return result
+
+
+def difference_summary(differences: Sequence[float]) -> dict[str, Any]:
+    """Mean and, of five or more, interquartile mean, with intervals; and the differences."""
+    if not differences:
+        return {}
+    result = mean_summary("difference", differences)
+    interval = interquartile_interval(differences)
+    if interval is not None:
+        result["iqm"] = float(interquartile_mean(differences))
+        result |= {"iqm_low": interval.low, "iqm_high": interval.high}
+    result["differences"] = " ".join(f"{value:.6g}" for value in differences)
+    return result
 
 
 def _bootstrap(

@@ -16,7 +16,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from torchrl_l1.report.settings import BASELINE
+from torchrl_l1.report.identity import BASELINE
 
 # Okabe and Ito: told apart with any colour vision. Grey is kept for the authors' curves.
 _ARMS = {"off": "#D55E00", "paper": "#0072B2", "reference": "#009E73", "slow": "#CC79A7"}

@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from torchrl_l1.experiment.run_directory import (
+    RunDirectory,
+    RunDirectoryInUse,
+    locked,
+)
+
+HOLD = """
+import subprocess, sys, time
+from pathlib import Path
+from torchrl_l1.experiment.run_directory import locked
+with locked(Path(sys.argv[1])) as ours:
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    print(ours, child.pid, flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture
+def holder(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that holds ``tmp_path / '.lock'``; it has a child that outlives it."""
+    command = [sys.executable, "-c", HOLD, str(tmp_path / ".lock")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        ours, child = process.stdout.readline().split()
+        assert ours == "True"
+        yield process
+        process.kill()
+        os.kill(int(child), 9)
+
+
+def test_a_lock_ends_with_its_process_and_not_with_its_children(
+    holder: subprocess.Popen[str], tmp_path: Path
+) -> None:
+    directory = RunDirectory(tmp_path)
+    assert directory.held()
+    with pytest.raises(RunDirectoryInUse, match="another process is running"):
+        directory.open({"seed": 0}, resume=False).__enter__()
+    assert not directory.config_file.exists()
+    holder.kill()
+    holder.wait()
+    assert not directory.held()
+    with directory.open({"seed": 0}, resume=False):
+        assert directory.held()
+
+
+def test_looking_for_a_lock_makes_none(tmp_path: Path) -> None:
+    assert not RunDirectory(tmp_path).held()
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_lock_of_a_directory_that_is_not_ours_is_seen(tmp_path: Path) -> None:
+    lock = tmp_path / ".lock"
+    with locked(lock) as ours:
+        assert ours
+        lock.chmod(0o400)
+        assert RunDirectory(tmp_path).held()
+    assert not RunDirectory(tmp_path).held()
+    assert lock.exists()
+
+
+def test_locks_of_older_versions_count(tmp_path: Path) -> None:
+    fcntl = pytest.importorskip("fcntl")
+    with (tmp_path / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        assert RunDirectory(tmp_path).held()
+    assert not RunDirectory(tmp_path).held()
+    with (
+        locked(tmp_path / ".lock"),
+        (tmp_path / ".lock").open() as lock,
+        pytest.raises(BlockingIOError),
+    ):
+        fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)

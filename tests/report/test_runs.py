@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from torchrl_l1.experiment.run_directory import RunDirectoryError
+from torchrl_l1.report.runs import find_readable_runs, find_runs
+
+WriteRun = Callable[..., Path]
+
+
+def test_unfinished_runs_say_how_far_they_are(write_run: WriteRun, tmp_path: Path) -> None:
+    write_run([1, 2, 3, 4], iterations=4)
+    write_run([1, 2], iterations=4)
+    write_run([], iterations=4)
+    done, half, begun = find_runs([tmp_path])
+    assert (done.finished, half.finished, begun.finished) == (True, False, False)
+    assert (half.progress, begun.progress) == ("2 of 4", "0 of 4")
+    assert done.final == 3.0
+
+
+def test_folders_may_overlap_and_foreign_files_are_passed_over(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    run = write_run([1])
+    for folder in (run / "wandb" / "files", tmp_path / "other", tmp_path / ".hidden" / "run"):
+        folder.mkdir(parents=True)
+    (run / "wandb" / "files" / "config.yaml").write_text("task: x\nseed: 1\n")
+    (tmp_path / "other" / "config.yaml").write_text("colour: blue\n")
+    (tmp_path / ".hidden" / "run" / "config.yaml").write_text("task: x\nseed: 1\n")
+    assert [found.path for found in find_runs([tmp_path, run, run.parent])] == [run]
+
+
+def spoil(file: Path, before: str, after: str) -> None:
+    text = file.read_text()
+    assert before in text
+    file.write_text(text.replace(before, after, 1))
+
+
+@pytest.mark.parametrize(
+    ("file", "before", "after", "message"),
+    [
+        ("metrics.csv", "return_mean", "reward", "no column return_mean"),
+        ("metrics.csv", "-7.0", "oops", "line 3: return_mean is 'oops'"),
+        ("metrics.csv", "-7.0", "nan", "line 3: return_mean is 'nan'"),
+        ("metrics.csv", "1,7500", "4,7500", "not 0, 1, 2"),
+        ("metrics.csv", "1,7500,-7.0,1.0,-7.0,0.5", "1,75", "return_mean is None"),
+        ("config.yaml", "outer_iterations: 3", "outer_iterations: 2", "3 iterations"),
+        ("config.yaml", "outer_iterations: 3", "outer_iterations: ???", "no outer_iterations"),
+        ("config.yaml", "task:", "task: [", "cannot read"),
+        ("versions.json", "{", "[[", "cannot read"),
+        ("evaluations/ablation.csv", "bias", "offset", "no column bias"),
+        ("evaluations/ablation.csv", "paper", "", "line 2: l1 is empty"),
+    ],
+)
+def test_a_corrupt_file_is_named(
+    write_run: WriteRun, tmp_path: Path, file: str, before: str, after: str, message: str
+) -> None:
+    row = {"l1": "paper", "noise": "none", "bias": 0, "gain": 1, "policy": "stochastic"}
+    row |= {"return_mean": -1, "episodes": 25}
+    run = write_run([-9, -7, -5], evaluations={"ablation": [row]})
+    spoil(run / file, before, after)
+    with pytest.raises(RunDirectoryError) as error:
+        find_runs([tmp_path])
+    assert str(run / file) in str(error.value)
+    assert message in str(error.value)
+    if file in ("metrics.csv", "config.yaml"):
+        with pytest.raises(RunDirectoryError):
+            find_readable_runs([tmp_path])
+    else:
+        (run,) = find_readable_runs([tmp_path]).runs
+        assert run.final == -7.0
+
+
+def test_what_cannot_be_read_is_left_out_and_the_rest_stays(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    row = {"l1": "paper", "noise": "none", "bias": 0, "gain": 1, "policy": "stochastic"}
+    row |= {"return_mean": -1, "episodes": 25}
+    tests = {"ablation": [row], "mine": [row]}
+    good, partly, lost, broken = (write_run([-9, -7, -5], evaluations=tests) for _ in range(4))
+    spoil(partly / "evaluations" / "mine.csv", "-1", "inf")
+    spoil(lost / "metrics.csv", "-7.0", "nan")
+    spoil(broken / "config.yaml", "task:", "task: [")
+    found = find_readable_runs([tmp_path, good.parent])
+    assert {run.path: set(run.evaluations) for run in found.runs} == {
+        good: {"ablation", "mine"},
+        partly: {"ablation"},
+    }
+    assert len(found.errors) == 3
+    for error, file in zip(
+        found.errors,
+        (partly / "evaluations" / "mine.csv", lost / "metrics.csv", broken / "config.yaml"),
+        strict=True,
+    ):
+        assert str(file) in str(error)
+
+
+def test_signals_and_times_are_read_where_they_are(write_run: WriteRun, tmp_path: Path) -> None:
+    phases = ("random", "fit", "trpo", "collect", "evaluate")
+    timings = [
+        {"iteration": i, **dict.fromkeys(phases, 0.0), "fit": i, "trpo": 1.0, "evaluate": 1e6}
+        for i in range(5)
+    ]
+    signals = {"l1/switch_rate": [9, 9, 0.1, 0.2, 0.3], "l1/u_a": [9, 9, 1, 2, 6]}
+    signals["l1/saturation"] = [0, 0, 0, 0, float("nan")]
+    path = write_run([1] * 5, "l1=paper", signals=signals, timings=timings, steps=1000)
+    bare = write_run([1] * 5, "l1=off")
+    runs = {run.path: run for run in find_runs([tmp_path])}
+    assert runs[path].final_signal("l1/switch_rate") == pytest.approx(0.2)
+    assert runs[path].final_signal("l1/u_a") == pytest.approx(3.0)
+    # (0 + 1) + ... + (4 + 1) seconds for 6000 steps, the random ones among them.
+    assert runs[path].milliseconds_per_step == pytest.approx(15 / 6000 * 1000)
+    assert math.isnan(runs[path].final_signal("l1/saturation"))
+    assert math.isnan(runs[bare].final_signal("l1/u_a"))
+    assert math.isnan(runs[bare].milliseconds_per_step)
+
+
+def test_a_short_run_took_its_time_for_all_its_steps(write_run: WriteRun, tmp_path: Path) -> None:
+    timing = {"iteration": 0, "random": 1.0, "fit": 2.0, "trpo": 3.0, "collect": 4.0}
+    write_run([1], timings=[timing], steps=1000)
+    (run,) = find_runs([tmp_path])
+    assert run.milliseconds_per_step == pytest.approx(10 / 2000 * 1000)
+
+
+def test_nothing_to_report_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no run in"):
+        find_runs([tmp_path])
+    with pytest.raises(FileNotFoundError, match="there is no folder"):
+        find_runs([tmp_path / "nowhere"])

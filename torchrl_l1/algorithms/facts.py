@@ -1,0 +1,105 @@
+"""What is known of an algorithm without running it: its stages, phases, ways to act and metrics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+KINDS = ("stochastic", "deterministic")
+"""The ways to act: with sampled actions, and with mean actions."""
+
+MEASURING = "evaluate"
+"""The phase that only measures returns: no part of the training."""
+
+WINDOW = 3
+"""Outer iterations at the end of a training that its return is the mean of, as in the paper."""
+
+_WORDS = {"stochastic": "sampled actions", "deterministic": "mean action"}
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage of an algorithm.
+
+    Attributes:
+        name: as users type it; that of what acts in it.
+        words: in headings.
+        window: outer iterations at its end that its return is the mean of.
+        policies: kinds of policies whose returns a run logs in it.
+        is_planner: whether what acts is a planner, whose sampled and mean actions are the same.
+    """
+
+    name: str
+    words: str = ""
+    window: int = WINDOW
+    policies: tuple[str, ...] = KINDS
+    is_planner: bool = False
+
+
+@dataclass(frozen=True)
+class AlgorithmFacts:
+    """An algorithm as those see it who run, evaluate and report it.
+
+    Attributes:
+        name: in headings and tables.
+        stages: in turn; where there are several, ``stage`` in the metrics counts them from 1.
+        phases: columns of ``timing.csv``, in the order in which an outer iteration goes through
+            them, with the words that a progress bar shows.
+        metrics: columns of ``metrics.csv`` with their meaning; ``l1/...`` only with L1 on.
+        color: of its lines where algorithms are compared.
+        tables: numbers of the paper's tables of it: of the returns of the ``training``, and of the
+            evaluations ``sim_to_real`` and ``ablation``.
+        compares_models: whether the paper compares forms of the model with it (Figure 2).
+        reference_logs: whether the authors have released logs of it.
+    """
+
+    name: str
+    stages: tuple[Stage, ...]
+    phases: Mapping[str, str]
+    metrics: Mapping[str, str]
+    color: str
+    tables: Mapping[str, str] = field(default_factory=dict)
+    compares_models: bool = False
+    reference_logs: bool = False
+
+    @property
+    def stage_names(self) -> tuple[str, ...]:
+        """The names of the stages in turn."""
+        return tuple(stage.name for stage in self.stages)
+
+    @property
+    def named_stages(self) -> tuple[Stage, ...]:
+        """The stages that metrics and evaluations name: none where there is only one."""
+        return self.stages if len(self.stages) > 1 else ()
+
+    @property
+    def samples(self) -> bool:
+        """Whether acting with sampled actions and with mean actions differ, at the end at least."""
+        return not self.stages[-1].is_planner
+
+    @property
+    def policies(self) -> Mapping[str, str]:
+        """The ways to act whose returns differ, and in words; one without words if no choice."""
+        return _WORDS if self.samples else {KINDS[0]: ""}
+
+    @property
+    def mean_action_stages(self) -> tuple[int, ...]:
+        """Places of the stages in which a run logs the return of either way to act."""
+        return tuple(i for i, stage in enumerate(self.stages) if len(stage.policies) > 1)
+
+    def acts_in_one_way(self, stage: str = "") -> bool:
+        """Whether sampled and mean actions are the same in a stage; any name may be asked for."""
+        return not self.samples or any(one.is_planner for one in self.stages if one.name == stage)
+
+    def position(self, stage: str) -> int:
+        """Place of a stage, from 0; -1 for any other name."""
+        return next((i for i, one in enumerate(self.stages) if one.name == stage), -1)
+
+    def actions(self, policy: str, stage: str = "") -> str:
+        """How a kind of policy acts, in words; empty where there is no choice."""
+        return "" if self.acts_in_one_way(stage) else _WORDS[policy]
+
+    def acting(self, policy: str, stage: str = "") -> str:
+        """What acts, in words: the stage's, and how if there is a choice."""
+        words = [one.words for one in self.stages if one.name == stage]
+        return ", ".join(filter(None, [*words, self.actions(policy, stage)]))

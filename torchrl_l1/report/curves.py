@@ -1,0 +1,315 @@
+"""Return against real steps: the learning curves of a task, and the panels of all such figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from torchrl_l1.report.identity import BASELINE
+from torchrl_l1.report.page import Page
+from torchrl_l1.report.published import Curves, ReferenceCurves
+from torchrl_l1.report.runs import Run
+from torchrl_l1.report.study import Cell, Study
+from torchrl_l1.report.style import (
+    arm_label,
+    color,
+    fit_scale,
+    grid,
+    legend_below,
+    named,
+    save,
+    title,
+)
+
+# Trainings that differ more in length are drawn over a logarithmic axis.
+_MOST_TIMES = 5
+
+_SHADES = ("0.82", "0.91")
+
+
+def curve_section(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
+    """A figure per task.
+
+    Args:
+        page: where to.
+        study: the runs.
+        reference: curves to draw behind.
+    """
+    page.heading(
+        "Learning curves",
+        "Thin: single seeds; bold: their mean"
+        + _dashed(study)
+        + "; grey: mean of the authors' logs, where they were given, cut where ours end"
+        * study.facts.reference_logs
+        + _bands(study)
+        + ".",
+    )
+    for task in study.tasks():
+        file = page.file("learning_curves", task)
+        figure = plot_task(study, task, file, reference, page.name)
+        page.figure(figure, f"Learning curves, {title(task)}")
+
+
+def _dashed(study: Study) -> str:
+    places = study.facts.mean_action_stages
+    words = [stage.words for place, stage in enumerate(study.facts.named_stages) if place in places]
+    where = f" in {' and '.join(words)}" if words else ""
+    return f"; dashed: mean of the return with the mean action{where}" if places else ""
+
+
+def _bands(study: Study) -> str:
+    words = [stage.words for stage in study.facts.named_stages]
+    if not words:
+        return ""
+    return f"; shaded: the stages before {words[-1]}, {' and '.join(words[:-1])}"
+
+
+def plot_task(
+    study: Study,
+    task: str,
+    file: Path,
+    reference: ReferenceCurves | None = None,
+    name: str = "",
+) -> Path | None:
+    """The main cells of a task, a panel per noise.
+
+    Args:
+        study: the runs.
+        task: the task.
+        file: where to.
+        reference: curves to draw behind.
+        name: of the algorithm, where there are several.
+
+    Returns:
+        the file, or ``None`` if no run has finished an iteration.
+    """
+    panels = []
+    for noise, lines in main_lines(study, task):
+        heading = named(name, title(task, noise))
+        authors = _authors(reference, task, noise)
+        earlier = len(study.facts.named_stages[:-1])
+        panels.append(Panel(heading, lines, authors, stage_bands(study, lines)[:earlier]))
+    return plot_panels(panels, file)
+
+
+def _authors(reference: ReferenceCurves | None, task: str, noise: str) -> list[Grey]:
+    if reference is None:
+        return []
+    found = []
+    for arm, label, style in ((BASELINE, "METRPO", "-"), ("paper", "L1-METRPO", ":")):
+        curves = reference.training(task, noise, arm)
+        if curves is not None:
+            found.append(Grey(f"authors' logs, {label}", style, curves))
+    return found
+
+
+def main_lines(study: Study, task: str) -> Iterator[tuple[str, list[Line]]]:
+    """A line for each main cell of a task, by noise."""
+    cells = [cell for cell in study.cells if cell.task == task and not cell.variant]
+    for noise in dict.fromkeys(cell.noise for cell in cells):
+        chosen = [cell for cell in cells if cell.noise == noise]
+        yield (
+            noise,
+            [
+                cell_line(study, cell, arm_label(cell.arm), color(3 + i, cell.arm))
+                for i, cell in enumerate(chosen)
+            ],
+        )
+
+
+def cell_line(study: Study, cell: Cell, label: str, shade: str) -> Line:
+    """The curves of a cell."""
+    return Line(label, shade, study.cells[cell], mean_action=study.facts.mean_action_stages)
+
+
+def stage_bands(study: Study, lines: Sequence[Line]) -> list[Band]:
+    """Where the stages are, in the run that is furthest; none where there is one stage only."""
+    furthest = max((run for line in lines for run in line.runs), key=lambda run: len(run.returns))
+    bands: list[Band] = []
+    for position, stage in enumerate(study.facts.named_stages):
+        steps = furthest.real_steps[furthest.during(position)]
+        if len(steps):
+            bands.append(Band(stage.words, bands[-1].end if bands else 0.0, float(steps[-1])))
+    return bands
+
+
+@dataclass(frozen=True)
+class Line:
+    """One cell in a panel.
+
+    Attributes:
+        label: in the legend.
+        color: of its curves.
+        runs: its runs.
+        mean_action: places of the stages, see :meth:`Run.during`, in which the return with the mean
+            action is a curve of its own.
+        style: of its curves, as matplotlib takes it.
+    """
+
+    label: str
+    color: str
+    runs: Sequence[Run]
+    mean_action: Sequence[int] = ()
+    style: Any = "-"
+
+    def own(self, run: Run) -> np.ndarray:
+        """Outer iterations ``(T,)`` in which the return with the mean action is drawn."""
+        never = np.full(len(run.returns), False)
+        return np.logical_or.reduce([never, *(run.during(place) for place in self.mean_action)])
+
+
+@dataclass(frozen=True)
+class Grey:
+    """Curves of the authors in a panel."""
+
+    label: str
+    style: str
+    curves: Curves
+
+
+@dataclass(frozen=True)
+class Band:
+    """A part of the training in a panel, from one number of real steps to another."""
+
+    label: str
+    start: float
+    end: float
+
+
+@dataclass(frozen=True)
+class Panel:
+    """What is drawn in the same axes.
+
+    Attributes:
+        heading: title of the panel.
+        lines: our curves.
+        authors: curves behind them.
+        bands: parts of the training to be shaded.
+        stage: position of the stage that is drawn, see :meth:`Run.during`; all of them if ``None``.
+    """
+
+    heading: str
+    lines: Sequence[Line]
+    authors: Sequence[Grey] = ()
+    bands: Sequence[Band] = ()
+    stage: int | None = None
+
+    def begun(self) -> Panel:
+        """The panel with those lines only that have something to draw."""
+        lines = [line for line in self.lines if any(len(run.returns) for run in line.runs)]
+        return replace(self, lines=lines)
+
+    def part(self, run: Run) -> np.ndarray:
+        """Which outer iterations ``(T,)`` of a run are drawn."""
+        every = np.full(len(run.returns), True)
+        return every if self.stage is None else run.during(self.stage)
+
+
+def plot_panels(panels: Sequence[Panel], file: Path, same_scale: bool = False) -> Path | None:
+    """A figure of some panels with one legend.
+
+    Args:
+        panels: the panels.
+        file: where to.
+        same_scale: whether all show the same range of returns.
+
+    Returns:
+        the file, or ``None`` if no run has finished an iteration.
+    """
+    begun = [panel for panel in (panel.begun() for panel in panels) if panel.lines]
+    if not begun:
+        return None
+    figure, axes = grid(len(begun), columns=3, width=4.6, height=3.9)
+    shown: list[np.ndarray] = []
+    for axis, panel in zip(axes, begun, strict=True):
+        shown += _draw(axis, panel)
+        axis.set_title(panel.heading, fontsize=10)
+    if same_scale:
+        low, high = zip(*(axis.get_ylim() for axis in axes), strict=True)
+        for axis in axes:
+            axis.set_ylim(min(low), max(high))
+    fit_scale(axes, shown)
+    bands = dict.fromkeys(band.label for panel in begun for band in panel.bands)
+    legend_below(figure, axes, last=("mean action", "unfinished", "authors", *bands))
+    return save(figure, file)
+
+
+def _draw(axis: Axes, panel: Panel) -> list[np.ndarray]:
+    """Draw a panel; returns the values that are in sight."""
+    shown = []
+    ends = [
+        max(run.real_steps[-1] for run in line.runs if len(run.returns)) for line in panel.lines
+    ]
+    end = max(ends)
+    for grey in panel.authors:
+        steps, values = grey.curves.real_steps.mean(axis=0), grey.curves.returns.mean(axis=0)
+        _line(axis, steps, values, grey.style, "0.55", 1.8, label=grey.label)
+        shown.append(values[steps <= end])
+    for line in panel.lines:
+        for run in line.runs:
+            style, part = line.style if run.finished else ":", panel.part(run)
+            steps, values = run.real_steps[part], run.returns[part]
+            _line(axis, steps, values, style, line.color, 0.8, alpha=0.5, marker=_dots(steps))
+            shown.append(values)
+            if not run.finished:
+                axis.plot([], [], ":", color="0.2", linewidth=0.8, label="unfinished run")
+        done = [run for run in line.runs if run.finished]
+        if done:
+            steps, means = np.mean(
+                [[values[panel.part(r)] for values in (r.real_steps, r.returns)] for r in done],
+                axis=0,
+            )
+            dots = _dots(steps)
+            _line(axis, steps, means, line.style, line.color, 2.2, label=line.label, marker=dots)
+            steps, mean_action = np.mean(
+                [
+                    [
+                        values[line.own(r) & panel.part(r)]
+                        for values in (r.real_steps, r.deterministic)
+                    ]
+                    for r in done
+                ],
+                axis=0,
+            )
+            if len(steps):
+                _line(axis, steps, mean_action, "--", line.color, 1.4, marker=_dots(steps))
+                axis.plot([], [], "--", color="0.2", linewidth=1.4, label="mean action")
+                shown.append(mean_action)
+    for band, shade in zip(panel.bands, _SHADES, strict=False):
+        axis.axvspan(
+            band.start / 1000, band.end / 1000, color=shade, linewidth=0, zorder=0, label=band.label
+        )
+    if panel.stage is not None:
+        axis.margins(x=0.03)
+    elif end > _MOST_TIMES * min(ends):
+        axis.set_xscale("log")
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.set_xlim(right=end / 1000 * 1.05)
+    else:
+        axis.set_xlim(0, end / 1000 * 1.02)
+    axis.set_xlabel("real environment steps (thousands)")
+    axis.set_ylabel("return (sum of rewards)")
+    axis.grid(alpha=0.3)
+    return shown
+
+
+def _dots(steps: np.ndarray) -> str:
+    """A single point makes no line."""
+    return "o" if len(steps) == 1 else ""
+
+
+def _line(
+    axis: Axes,
+    steps: np.ndarray,
+    values: np.ndarray,
+    style: Any,
+    shade: str,
+    width: float,
+    **options: Any,
+) -> None:
+    axis.plot(steps / 1000, values, linestyle=style, color=shade, linewidth=width, **options)

@@ -1,0 +1,412 @@
+"""The sections about evaluations of frozen policies: their rows, tables and text."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from torchrl_l1.algorithms.facts import AlgorithmFacts
+from torchrl_l1.envs import DISTURBANCES
+from torchrl_l1.experiment.matrix import undisturbed
+from torchrl_l1.report.evaluation_data import Evaluation, condition_columns
+from torchrl_l1.report.evaluation_figures import (
+    PHASES,
+    plot_ablation,
+    plot_disturbances,
+    plot_tuning,
+    tuning_rows,
+)
+from torchrl_l1.report.identity import BASELINE, facts
+from torchrl_l1.report.page import (
+    Footnotes,
+    Page,
+    difference_text,
+    grouped,
+    markdown,
+    number,
+    paper_text,
+    return_text,
+)
+from torchrl_l1.report.published import published_cell
+from torchrl_l1.report.runs import Run
+from torchrl_l1.report.statistics import difference_summary, mean_interval
+from torchrl_l1.report.study import Study, noise_order, variant_text
+from torchrl_l1.report.style import arm_label, named, noise_words, title
+
+Row = Mapping[str, Any]
+Key = tuple[Any, ...]
+Section = Callable[[Page, AlgorithmFacts, Sequence[Row]], None]
+
+# Longer tables are left to their CSV.
+_MOST_ROWS = 160
+
+
+def evaluation_sections(page: Page, study: Study) -> None:
+    """A section per evaluation: those of the paper first, then the user's own."""
+    special: dict[str, Section] = {
+        "sim_to_real": _sim_to_real,
+        "ablation": _ablation,
+        "disturbances": _disturbances,
+    }
+    for name in sorted(evaluation_names(study), key=lambda n: ([*special, n].index(n), n)):
+        rows = evaluation_rows(study, name)
+        if name == "ablation":
+            rows = ablation_rows(rows)
+        if rows:
+            special.get(name, _other(name))(page, study.facts, rows)
+            _tuning(page, study.facts, name, rows)
+            page.csv(name, rows)
+
+
+def _sim_to_real(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> None:
+    page.heading(
+        "Sim to real",
+        "Policies and models trained without noise, frozen and tested with it, L1 off and on"
+        + _papers_table(algorithm, "sim_to_real")
+        + ": mean ± standard deviation over training seeds, 95 % interval of "
+        "the mean; differences are taken policy by policy.",
+    )
+    _evaluation_tables(page, algorithm, rows)
+
+
+def _ablation(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> None:
+    page.heading(
+        "Ablation",
+        "L1 in neither phase, in one of them, or in both"
+        + _papers_table(algorithm, "ablation", " and ablation figure")
+        + ": bars are means, dots training seeds, lines 95 % intervals.",
+    )
+    for l1 in sorted({row["training_l1"] for row in rows} - {BASELINE}):
+        mine = [row for row in rows if {row["training_l1"], row["l1"]} <= {BASELINE, l1}]
+        for actions, chosen in _by_actions(algorithm, mine):
+            page.text(f"{_listed(f'L1 {l1}', actions)}:", ablation_table(chosen))
+        for variant, stage in dict.fromkeys((row["variant"], _stage(row)) for row in mine):
+            chosen = [
+                row
+                for row in mine
+                if (row["variant"], _stage(row), row["policy"]) == (variant, stage, "stochastic")
+            ]
+            if chosen:
+                file = page.file("ablation", l1, variant, stage)
+                caption = _listed(f"Ablation, L1 {l1}", variant, stage)
+                page.figure(plot_ablation(chosen, file, page.name), caption)
+
+
+def _disturbances(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> None:
+    page.heading(
+        "Disturbances",
+        f"Return of frozen policies against {_disturbances_in_words()} that the model "
+        "has never seen: mean over training seeds, with its 95 % interval as a band; below it, the "
+        "difference to the same policies without L1 with the interval of its mean.",
+    )
+    for heading, words, chosen in _training_cells(rows):
+        stage = _stage(chosen[0])
+        heading += f", stage {stage}" * bool(stage)
+        file = page.file("disturbances", *words)
+        drawn = plot_disturbances(chosen, named(page.name, heading), file, algorithm)
+        page.figure(drawn, heading)
+
+
+def _disturbances_in_words() -> str:
+    """All that there are.
+
+    Examples:
+        >>> _disturbances_in_words()
+        'an actuator bias and an actuator gain'
+    """
+    words = [entry.words for entry in DISTURBANCES.values()]
+    *rest, last = (f"a{'n' * (text[0] in 'aeiou')} {text}" for text in words)
+    return " and ".join(filter(None, (", ".join(rest), last)))
+
+
+def _tuning(page: Page, algorithm: AlgorithmFacts, name: str, rows: Sequence[Row]) -> None:
+    """A figure per training cell, where the tests go through values of the controller."""
+    explained = False
+    for heading, words, chosen in _training_cells(rows):
+        policy, swept = tuning_rows(chosen)
+        acting = algorithm.acting(policy, _stage(chosen[0]))
+        caption = f"{heading}; tested with {acting}" if acting else heading
+        file = page.file("sweep", name, *words)
+        drawn = plot_tuning(swept, named(page.name, caption), file)
+        if drawn is not None and not explained:
+            page.text(
+                "Switches and returns against the values of the controller that the tests set: "
+                "means over training seeds, lines 95 % intervals of the returns; dashed, the "
+                "same policies without L1."
+            )
+            explained = True
+        page.figure(drawn, caption)
+
+
+def _training_cells(rows: Sequence[Row]) -> Iterator[tuple[str, tuple[str, ...], list[Row]]]:
+    """The rows of each cell and stage of the training, with a heading and the words of a file."""
+
+    def place(row: Row) -> tuple[str, ...]:
+        keys = ("task", "training_noise", "training_l1", "variant")
+        return (*(row[key] for key in keys), _stage(row))
+
+    for cell in dict.fromkeys(map(place, rows)):
+        task, noise, l1, variant, _ = cell
+        heading = f"{title(task)}: trained with {noise_words(noise)} and {arm_label(l1)}"
+        heading += f" ({variant})" * bool(variant)
+        yield heading, cell, [row for row in rows if place(row) == cell]
+
+
+def _other(name: str) -> Section:
+    def section(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> None:
+        page.heading(
+            f"Evaluation `{name}`",
+            "Frozen policies under its conditions: mean ± standard deviation over training "
+            "seeds, 95 % interval of the mean; differences are taken policy by policy.",
+        )
+        _evaluation_tables(page, algorithm, rows)
+
+    return section
+
+
+def _evaluation_tables(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> None:
+    """A table per L1 setting of the training and kind of policy."""
+    for l1 in dict.fromkeys(row["training_l1"] for row in rows):
+        mine = [row for row in rows if row["training_l1"] == l1]
+        for actions, chosen in _by_actions(algorithm, mine):
+            if len(chosen) <= _MOST_ROWS:
+                words = _listed(f"Trained with {arm_label(l1)}", actions)
+                swept = any("option" in row for row in chosen)
+                table = tuning_table if swept else evaluation_table
+                page.text(f"{words}:", table(chosen))
+
+
+def _by_actions(algorithm: AlgorithmFacts, rows: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
+    """The rows by how the policies act, in words: those that have no choice first."""
+    groups: dict[str, list[Row]] = {words: [] for words in ("", *algorithm.policies.values())}
+    for row in rows:
+        groups[algorithm.actions(row["policy"], _stage(row))].append(row)
+    yield from ((words, found) for words, found in groups.items() if found)
+
+
+def _papers_table(algorithm: AlgorithmFacts, kind: str, more: str = "") -> str:
+    table = algorithm.tables.get(kind)
+    return f" (the paper's Table {table}{more})" if table else ""
+
+
+def _stage(row: Row) -> str:
+    return str(row.get("stage", ""))
+
+
+def _listed(*words: str) -> str:
+    return ", ".join(filter(None, words))
+
+
+def evaluation_names(study: Study) -> list[str]:
+    """Names of the evaluations that there are."""
+    return sorted({name for run in study.runs for name in run.evaluations})
+
+
+def evaluation_rows(study: Study, name: str) -> list[dict[str, Any]]:
+    """One row per cell of the training and condition of the test.
+
+    ``return_values`` holds the mean returns of the single training seeds, ``std`` is their
+    population standard deviation (as in the paper's tables), and the differences are those to
+    the same policies tested without L1. Runs that are not finished are left out. Where ``l1``
+    is equal to ``training_l1`` the policy was tested with the controller of its training;
+    another controller of that name is marked. Where the test has set values of the controller,
+    ``l1`` names them, and ``option``, ``epsilon`` and ``alpha`` hold them. ``stage`` is there
+    where a test names it.
+    """
+    rows = []
+    for cell, runs in study.cells.items():
+        done = [run for run in runs if run.finished and name in run.evaluations]
+        tests: dict[Key, list[tuple[Run, Evaluation]]] = {}
+        for run in done:
+            for test in run.evaluations[name]:
+                key = (_tested(run, test), *test.condition[1:])
+                tests.setdefault(key, []).append((run, test))
+        names = condition_columns()
+        places = {key: study.facts.position(key[-1]) for key in tests}
+        for key in sorted(tests, key=lambda key: (places[key], _order(key, tests[key][0][1]))):
+            rows.append(
+                {
+                    "task": cell.task,
+                    "training_noise": cell.noise,
+                    "training_l1": cell.arm,
+                    "variant": variant_text(cell.variant),
+                    **dict(zip(names, key, strict=True)),
+                    **_set_values(tests[key][0][1]),
+                    **_summary(tests[key]),
+                    **_against_baseline(key, tests),
+                    **_published(runs[0], key),
+                }
+            )
+    if not any(row["stage"] for row in rows):
+        for row in rows:
+            del row["stage"]
+    return rows
+
+
+def ablation_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Those rows of an evaluation that the ablation is made of, with the ``phase`` of L1.
+
+    The test has the noise of the training and no disturbance, and L1 is on in both phases, in
+    one, or in neither. Where L1 is on in both it is the same L1.
+    """
+    chosen = []
+    for row in rows:
+        trained, tested = row["training_l1"], row["l1"]
+        on = {trained, tested} - {BASELINE}
+        if undisturbed(row) and row["training_noise"] == row["noise"] and len(on) < 2:
+            chosen.append({**row, "phase": phase(trained, tested)})
+    return sorted(chosen, key=lambda row: PHASES.index(row["phase"]))
+
+
+def phase(trained: str, tested: str) -> str:
+    """Where L1 is on: ``neither``, ``training only``, ``testing only`` or ``both``."""
+    if trained == BASELINE:
+        return "neither" if tested == BASELINE else "testing only"
+    return "training only" if tested == BASELINE else "both"
+
+
+def _tested(run: Run, test: Evaluation) -> str:
+    """The controller of a test: the training's L1 setting if it is that of the training."""
+    what = run.identity
+    if test.tuned or BASELINE in (what.arm, test.l1):
+        return test.controller
+    # Older tables were made with the options as shipped.
+    own = test.l1 == what.shipped if test.own_l1 is None else test.own_l1
+    if own:
+        return what.arm
+    return f"{test.l1} (not as trained)" if test.l1 == what.arm else test.l1
+
+
+def _set_values(test: Evaluation) -> dict[str, Any]:
+    values = {"option": test.l1, "epsilon": test.epsilon, "alpha": test.alpha}
+    return values if test.tuned else {}
+
+
+def _summary(tests: Sequence[tuple[Run, Evaluation]]) -> dict[str, Any]:
+    values = [test.return_mean for _, test in tests]
+    result: dict[str, Any] = {
+        "training_seeds": len(values),
+        "episodes_per_seed": " ".join(sorted({str(test.episodes) for _, test in tests})),
+        "return_mean": float(np.mean(values)),
+        "std": float(np.std(values)),
+        "return_values": " ".join(f"{value:.6g}" for value in values),
+    }
+    interval = mean_interval(values)
+    if interval is not None:
+        result |= {"return_low": interval.low, "return_high": interval.high}
+    switches = 1000 * float(np.mean([test.switch_rate for _, test in tests]))
+    if np.isfinite(switches):
+        result["switches_per_1000_steps"] = switches
+    return result
+
+
+def _against_baseline(
+    key: Key, tests: Mapping[Key, Sequence[tuple[Run, Evaluation]]]
+) -> dict[str, Any]:
+    if key[0] == BASELINE:
+        return {}
+    without = {run.path: test.return_mean for run, test in tests.get((BASELINE, *key[1:]), ())}
+    return difference_summary(
+        [test.return_mean - without[run.path] for run, test in tests[key] if run.path in without]
+    )
+
+
+def _published(run: Run, key: Key) -> dict[str, str]:
+    row = dict(zip(condition_columns(), key, strict=True))
+    what = run.identity
+    usual = undisturbed(row) and row["policy"] == "stochastic"
+    if not (usual and what.as_published and "sim_to_real" in facts(what.algorithm).tables):
+        return {}
+    cell = published_cell(what.task, what.noise, what.arm, row["noise"], row["l1"])
+    return {} if cell is None else cell.columns()
+
+
+def _order(key: Key, test: Evaluation) -> Key:
+    l1, noise, *disturbances, policy, _ = key
+    # By the values, where their texts would put 10 before 3.
+    controller = (test.l1, test.epsilon or 0.0, test.alpha or 0.0) if test.tuned else (l1, 0.0, 0.0)
+    place = (policy != "stochastic", noise_order(noise), *disturbances)
+    return *place, l1 != BASELINE, controller
+
+
+def evaluation_table(rows: Sequence[Row]) -> str:
+    """Frozen policies under other conditions than they were trained in, a column per L1.
+
+    Args:
+        rows: of one kind of policy and one L1 setting of the training.
+    """
+    notes = Footnotes()
+    tested = list(dict.fromkeys(row["l1"] for row in rows))
+    keys = ("task", "training_noise", "variant", "stage", "noise", *DISTURBANCES)
+    lines = []
+    for _, found in grouped(rows, keys, "l1"):
+        first = next(iter(found.values()))
+        line = _place(first) | {"training seeds": str(first["training_seeds"])}
+        line |= {f"L1 {l1}": return_text(found.get(l1)) for l1 in tested}
+        line |= {
+            f"L1 {l1} less off": difference_text(found.get(l1, {}))
+            for l1 in tested
+            if l1 != BASELINE
+        }
+        line |= {f"paper, L1 {l1}": paper_text(found.get(l1, {}), notes) for l1 in tested}
+        lines.append(line)
+    return notes.below(markdown(lines))
+
+
+def tuning_table(rows: Sequence[Row]) -> str:
+    """The same where tests set values of the controller: a line per controller.
+
+    Args:
+        rows: of one kind of policy and one L1 setting of the training.
+    """
+    lines = [
+        {
+            **_place(row),
+            "L1": row.get("option", row["l1"]),
+            "epsilon": number(row.get("epsilon")),
+            "alpha": number(row.get("alpha")),
+            "training seeds": str(row["training_seeds"]),
+            "return": return_text(row),
+            "less off": difference_text(row),
+            "switches per 1000 steps": number(row.get("switches_per_1000_steps")),
+        }
+        for row in rows
+    ]
+    return markdown(lines)
+
+
+def _place(row: Row) -> dict[str, str]:
+    """Where a test belongs; what is neutral is left empty."""
+    return {
+        "task": row["task"],
+        "training noise": "" if row["training_noise"] == "none" else row["training_noise"],
+        "variant": row["variant"],
+        "stage": _stage(row),
+        "noise": row["noise"],
+        **{
+            name: "" if row[name] == entry.neutral else f"{row[name]:g}"
+            for name, entry in DISTURBANCES.items()
+        },
+    }
+
+
+def ablation_table(rows: Sequence[Row]) -> str:
+    """L1 in neither phase, in one or in both, side by side.
+
+    Args:
+        rows: of one kind of policy and one kind of L1.
+    """
+    notes = Footnotes()
+    lines = []
+    keys = ("task", "noise", "variant", "stage")
+    for cell, found in grouped(rows, keys, "phase"):
+        line = dict(zip(keys, cell, strict=True))
+        line |= {phase: return_text(found.get(phase)) for phase in PHASES}
+        line["training seeds"] = ", ".join(
+            sorted({str(row["training_seeds"]) for row in found.values()})
+        )
+        line |= {f"paper, {phase}": paper_text(found.get(phase, {}), notes) for phase in PHASES}
+        lines.append(line)
+    return notes.below(markdown(lines))

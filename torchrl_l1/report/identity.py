@@ -1,0 +1,174 @@
+"""What a run was, from its configuration: task, noise, arm, and the settings that matter."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from torchrl_l1.algorithms import MBMF, METRPO, PETS
+from torchrl_l1.algorithms.facts import AlgorithmFacts
+from torchrl_l1.algorithms.pets import DETS
+from torchrl_l1.control.config import DEFAULT_ALPHA
+from torchrl_l1.experiment.l1_options import closest_option, departures, filter_gain
+from torchrl_l1.experiment.recipes import shared_dir
+from torchrl_l1.experiment.settings import VOLATILE_KEYS, L1Settings, flatten, schema_defaults
+
+ALGORITHMS: Mapping[str, AlgorithmFacts] = {
+    "metrpo": METRPO.facts,
+    "mbmf": MBMF.facts,
+    "pets": PETS.facts,
+    "dets": DETS,
+}
+"""By name, see :class:`Identity`, in the order in which a report shows them."""
+
+BASELINE = "off"
+"""Name of the arm without L1."""
+
+NOISES = ("none", "action", "observation", "both")
+"""Noise settings in the order in which tables and figures show them."""
+
+# Keys that tell runs apart in other ways, or that do not touch the result.
+_NOT_COMPARED = (*VOLATILE_KEYS, "seed", "task", "threads", "device", "compile_plans", "l1.compile")
+# Two ways to give the gain of the filter, which is compared under the first of these names.
+_FILTER_KEYS = ("l1.alpha", "l1.cutoff")
+_NOISE_KEYS = ("perturbation.action_noise", "perturbation.observation_noise")
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What a run is one sample of.
+
+    Attributes:
+        algorithm: ``metrpo``, ``mbmf``, ``pets``, or ``dets`` for PETS with members that predict
+            points.
+        task: such as ``half_cheetah``.
+        noise: option of the ``noise`` group that its noise is equal to, else what there is of it
+            with its half-width, such as ``action 0.3``.
+        arm: ``off``, or the option of the ``l1`` group that its controller is closest to,
+            whatever the gain of its filter.
+        seed: its seed.
+        outer_iterations: the number of rows of a finished run.
+        shared: settings that both arms have, key by key, as text.
+        l1: settings of the controller as text; none for the baseline. ``l1.alpha`` is the gain
+            of the filter, however it was given.
+        departures: those in which the controller departs from the option ``arm`` as shipped;
+            epsilon does not count.
+        shipped: the option that the controller is equal to but for epsilon; empty if there is
+            none.
+    """
+
+    algorithm: str
+    task: str
+    noise: str
+    arm: str
+    seed: int
+    outer_iterations: int
+    shared: Mapping[str, str]
+    l1: Mapping[str, str]
+    departures: Mapping[str, str]
+    shipped: str
+
+    @property
+    def model_form(self) -> str:
+        """``nonlinear`` or ``affine`` in the control."""
+        return self.shared.get("model.form", "nonlinear")
+
+    @property
+    def as_published(self) -> bool:
+        """Whether the published tables are of such runs: algorithm, model and controller."""
+        affine = self.model_form == "affine"
+        return "training" in facts(self.algorithm).tables and not affine and not self.departures
+
+
+def identify(config: Mapping[str, Any]) -> Identity:
+    """Read a run's resolved configuration.
+
+    Settings that it does not mention, since it is older than they are, have the schema's
+    defaults.
+
+    Raises:
+        KeyError: if it lacks a key that every run has.
+        ValueError: if such a key has no usable value.
+    """
+    settings = {**schema_defaults(config), **flatten(config)}
+    for key in ("task", "seed", "outer_iterations"):
+        if settings.get(key) in (None, "???"):
+            raise KeyError(f"the configuration has no {key}")
+    task = str(settings["task"])
+    controller = L1Settings(**{f.name: settings[f"l1.{f.name}"] for f in fields(L1Settings)})
+    arm = closest_option(controller, task, by_filter=False)
+    closest = closest_option(controller, task)
+    compared = {
+        key: _text(value)
+        for key, value in settings.items()
+        if key not in (*_NOT_COMPARED, *_NOISE_KEYS, *_FILTER_KEYS)
+        and key.split(".")[0] not in VOLATILE_KEYS
+    }
+    l1 = {k: v for k, v in compared.items() if k.startswith("l1.")}
+    on = arm != BASELINE
+    departed = departures(controller, arm, task) if on else {}
+    return Identity(
+        algorithm=_algorithm(settings),
+        task=task,
+        noise=_noise(settings),
+        arm=arm,
+        seed=int(settings["seed"]),
+        outer_iterations=int(settings["outer_iterations"]),
+        shared={k: v for k, v in compared.items() if k not in l1},
+        l1={**l1, _FILTER_KEYS[0]: _text(filter_gain(controller, task))} if on else {},
+        departures={f"l1.{key}": _text(value) for key, value in departed.items()},
+        shipped="" if on and departures(controller, closest, task) else closest,
+    )
+
+
+def default_text(key: str, algorithm: str) -> str | None:
+    """A key's default as :class:`Identity` writes values; ``None`` if the schema has none."""
+    schema = schema_defaults({"algorithm": "pets" if algorithm == "dets" else algorithm})
+    defaults = {**schema, _FILTER_KEYS[0]: DEFAULT_ALPHA}
+    return _text(defaults[key]) if key in defaults else None
+
+
+def _algorithm(settings: Mapping[str, Any]) -> str:
+    name = str(settings["algorithm"])
+    points = settings.get("model.head") == "deterministic"
+    return "dets" if name == "pets" and points else name
+
+
+def _noise(settings: Mapping[str, Any]) -> str:
+    for name, values in _noises().items():
+        if all(settings.get(f"perturbation.{key}") == value for key, value in values.items()):
+            return name
+    # perturbation.action_noise is shown as "action".
+    levels = {key.split(".")[1].split("_")[0]: float(settings[key]) for key in _NOISE_KEYS}
+    return ", ".join(f"{kind} {level:g}" for kind, level in levels.items() if level)
+
+
+@cache
+def _noises() -> dict[str, dict[str, Any]]:
+    files = sorted((shared_dir() / "noise").glob("*.yaml"))
+    return {file.stem: flatten(OmegaConf.to_container(OmegaConf.load(file))) for file in files}
+
+
+def _text(value: Any) -> str:
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    return str(value)
+
+
+def facts(algorithm: str) -> AlgorithmFacts:
+    """What is known of an algorithm.
+
+    Raises:
+        ValueError: if nothing is.
+
+    Examples:
+        >>> facts("dets").samples
+        False
+    """
+    if algorithm not in ALGORITHMS:
+        raise ValueError(f"no report of algorithm {algorithm!r}; there are {', '.join(ALGORITHMS)}")
+    return ALGORITHMS[algorithm]

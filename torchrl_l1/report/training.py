@@ -1,0 +1,428 @@
+"""What a training has reached: the paper's Table 1, paired differences, comparisons, and times."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_l1.report.curves import Grey, Panel, cell_line, curve_section, plot_panels
+from torchrl_l1.report.identity import BASELINE, facts
+from torchrl_l1.report.page import (
+    Footnotes,
+    Page,
+    Row,
+    difference_columns,
+    interval_text,
+    markdown,
+    number,
+    paper_text,
+    spread_text,
+)
+from torchrl_l1.report.published import ReferenceCurves, published_cell
+from torchrl_l1.report.runs import Run
+from torchrl_l1.report.stages import stage_sections
+from torchrl_l1.report.statistics import (
+    difference_summary,
+    final_return,
+    mean_summary,
+    published_spread,
+)
+from torchrl_l1.report.study import Cell, Study, place_columns, with_baselines
+from torchrl_l1.report.style import arm_label, color, named, title
+
+_PHASES = {
+    "fit": "fit",
+    "trpo": "TRPO",
+    "clone": "cloning",
+    "tune": "PPO",
+    "collect": "collection",
+    "evaluate": "measuring returns",
+}
+
+
+def training_sections(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
+    """Everything that is known from the runs' own returns.
+
+    Args:
+        page: where to.
+        study: the runs.
+        reference: curves of the authors' logs; left out where they are of another algorithm.
+    """
+    if not study.facts.reference_logs:
+        reference = None
+    _training(page, study, reference)
+    _pairs(page, study)
+    curve_section(page, study, reference)
+    stage_sections(page, study)
+    _comparisons(page, study, reference)
+    _time(page, study)
+
+
+def _training(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
+    rows = {cell: training_row(cell, runs, reference) for cell, runs in study.cells.items()}
+    page.heading(
+        "Training",
+        "Return is the mean over seeds of the mean over the last three outer iterations"
+        + " (fewer where the last stage has or counts fewer)" * bool(study.facts.named_stages)
+        + ", of sampled actions as in the paper" * study.facts.samples
+        + "; the spread is the paper's ± (standard deviation over "
+        "seeds in each of these iterations, averaged), the interval that of the mean over seeds. "
+        + _l1_did(study),
+    )
+    page.text(training_table([row for cell, row in rows.items() if not cell.variant]))
+    page.text(_main_settings(study))
+    page.csv("training", list(rows.values()))
+
+
+def _l1_did(study: Study) -> str:
+    if study.facts.named_stages:
+        return f"L1 acts in {study.facts.named_stages[0].words} only; what it did is under Stages."
+    return (
+        "What L1 did (switches, mean norm of its input, share of actions that a bound cut) are "
+        "means over the same iterations."
+    )
+
+
+def _main_settings(study: Study) -> str:
+    lines = []
+    for task in study.tasks():
+        cells = [cell for cell in study.cells if cell.task == task and not cell.variant]
+        settings: dict[str, None] = {}
+        for cell in cells:
+            shared = study.main_settings(task)
+            for key, value in study.main_settings(task, cell.arm).items():
+                where = "" if key in shared else f" (L1 {cell.arm})"
+                settings[f"`{key}={value}`{where}"] = None
+            for key, value in study.cells[cell][0].identity.departures.items():
+                settings[f"`{key}={value}` (L1 {cell.arm})"] = None
+        if settings:
+            lines.append(f"- {task}: {', '.join(settings)}")
+    if not lines:
+        return ""
+    return "Runs with other settings than these have tables of their own:\n\n" + "\n".join(lines)
+
+
+def run_rows(study: Study) -> list[dict[str, Any]]:
+    """One row per run, unfinished ones included."""
+    return [
+        {
+            **place_columns(cell),
+            "seed": run.identity.seed,
+            "iterations": len(run.returns),
+            "of": run.identity.outer_iterations,
+            "real_steps": int(run.real_steps[-1]) if len(run.real_steps) else 0,
+            "return": run.final if run.finished else None,
+            **_deterministic(run, study),
+            **(_signals([run]) if run.finished else {}),
+            "path": str(run.path),
+        }
+        for cell, runs in study.cells.items()
+        for run in runs
+    ]
+
+
+def training_row(
+    cell: Cell, runs: Sequence[Run], reference: ReferenceCurves | None = None
+) -> dict[str, Any]:
+    """A cell: our returns over its finished runs, the paper's, the authors' logged ones.
+
+    The return is the mean over seeds of the mean over :attr:`Run.ending`.
+    """
+    done = [run for run in runs if run.finished]
+    place = (cell.task, cell.noise, cell.arm)
+    row: dict[str, Any] = {**place_columns(cell), "seeds": len(done)}
+    if done:
+        row |= mean_summary("return", [run.final for run in done])
+        if len(done) > 1:
+            row["published_spread"] = published_spread(
+                np.array([run.returns[run.ending] for run in done])
+            )
+        if facts(runs[0].identity.algorithm).samples:
+            row |= mean_summary("deterministic", [run.final_deterministic for run in done])
+        row["real_steps"] = round(float(np.mean([run.real_steps[-1] for run in done])))
+        row |= _signals(done)
+    row["unfinished"] = "; ".join(
+        f"seed {run.identity.seed}: {run.progress} iterations" for run in runs if not run.finished
+    )
+    what = runs[0].identity
+    affine = what.model_form == "affine"
+    # The paper prints no returns with control-affine models; their curves are in its Figure 2.
+    published = None
+    if what.as_published:
+        published = published_cell(*place, *place[1:], what.algorithm)
+    if published is not None:
+        row |= published.columns()
+    curves = None
+    if reference is not None and affine and cell.noise == "none" and cell.arm == BASELINE:
+        curves = reference.model_form(cell.task, "affine")
+    elif reference is not None and published is not None:
+        curves = reference.training(*place)
+    if curves is not None:
+        row |= {
+            "authors_mean": float(final_return(curves.returns).mean()),
+            "authors_spread": published_spread(curves.returns),
+            "authors_seeds": len(curves.returns),
+        }
+    return row
+
+
+def paired_rows(study: Study) -> list[dict[str, Any]]:
+    """L1 less the baseline over the seeds that both have, by stochastic and mean actions.
+
+    Where there is one way to act only, a row has no ``policy``.
+    """
+    rows = []
+    for cell, runs in study.cells.items():
+        if cell.arm == BASELINE:
+            continue
+        pairs, single = with_baselines(study, runs)
+        for policy in study.facts.policies:
+            finals = [
+                (l1.final, off.final)
+                if policy == "stochastic"
+                else (l1.final_deterministic, off.final_deterministic)
+                for l1, off in pairs
+            ]
+            differences = [ours - base for ours, base in finals]
+            rows.append(
+                {
+                    **place_columns(cell),
+                    **({"policy": policy} if study.facts.samples else {}),
+                    "pairs": len(pairs),
+                    "seeds": " ".join(str(run.identity.seed) for run, _ in pairs),
+                    **difference_summary(differences),
+                    "without_pair": " ".join(single),
+                }
+            )
+    return rows
+
+
+def _signals(runs: Sequence[Run]) -> dict[str, float]:
+    """What L1 did at the end of the training; what is known of it."""
+    values = {
+        "switches_per_1000": [1000 * run.final_signal("l1/switch_rate") for run in runs],
+        "u_a": [run.final_signal("l1/u_a") for run in runs],
+        "saturation": [run.final_signal("l1/saturation") for run in runs],
+    }
+    means = {name: float(np.mean(numbers)) for name, numbers in values.items()}
+    return {name: mean for name, mean in means.items() if np.isfinite(mean)}
+
+
+def _deterministic(run: Run, study: Study) -> dict[str, float | None]:
+    """The return with mean actions, if it is another one."""
+    if not study.facts.samples:
+        return {}
+    return {"return_deterministic": run.final_deterministic if run.finished else None}
+
+
+def training_table(rows: Sequence[Row]) -> str:
+    """The paper's Table 1, ours beside it, with footnotes to its cells."""
+    notes = Footnotes()
+    lines = [
+        {
+            "task": row["task"],
+            "noise": row["noise"],
+            "L1": row["l1"],
+            "variant": row["variant"],
+            "return ± spread": spread_text(row.get("return_mean"), row.get("published_spread")),
+            "95 % interval": interval_text(row, "return"),
+            "with the mean action": number(row.get("deterministic_mean")),
+            "95 % interval of it": interval_text(row, "deterministic"),
+            "seeds": str(row["seeds"]),
+            "real steps": str(row.get("real_steps", "–")),
+            "switches per 1000 steps": number(row.get("switches_per_1000")),
+            "L1 input": number(row.get("u_a")),
+            "saturation": number(row.get("saturation")),
+            "paper": paper_text(row, notes),
+            "authors' logs": spread_text(row.get("authors_mean"), row.get("authors_spread")),
+            "unfinished": row["unfinished"],
+        }
+        for row in rows
+    ]
+    return notes.below(markdown(lines))
+
+
+def _pairs(page: Page, study: Study) -> None:
+    rows = paired_rows(study)
+    if not any(row["pairs"] for row in rows):
+        return
+    page.heading(
+        "L1 less baseline",
+        "Differences of the same return between runs of the same seed and settings with and "
+        "without L1, with 95 % intervals; the interquartile mean takes five pairs, and fewer than "
+        "three are shown as they are. With a handful of seeds a single one may move an interval "
+        "to either side of 0.",
+    )
+    page.text(paired_table(rows))
+    page.csv("pairs", rows)
+
+
+def paired_table(rows: Sequence[Row]) -> str:
+    """Differences to the baseline of the same seed."""
+    lines = [
+        {
+            "task": row["task"],
+            "noise": row["noise"],
+            "L1": row["l1"],
+            "variant": row["variant"],
+            "policy": row.get("policy", ""),
+            "pairs": str(row["pairs"]),
+            **difference_columns(row),
+            "seeds without a pair": row["without_pair"],
+        }
+        for row in rows
+    ]
+    return markdown(lines)
+
+
+def _comparisons(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
+    for keys in study.comparisons():
+        cells = study.compared(keys)
+        page.heading(
+            f"By {' and '.join(f'`{key}`' for key in keys)}",
+            "The same table for runs that depart from the main ones in these settings, and the "
+            "main ones of the same task and noise."
+            + " It is the comparison of the paper's Figure 2."
+            * ("model.form" in keys and study.facts.compares_models),
+        )
+        rows = [
+            training_row(cell, study.cells[cell], reference)
+            | {"variant": study.describe(cell, keys)}
+            for cell in cells
+        ]
+        page.text(training_table(rows))
+        for task in dict.fromkeys(cell.task for cell in cells):
+            file = page.file("by", *keys, task)
+            figure = plot_comparison(study, task, keys, file, reference, page.name)
+            page.figure(figure, f"Learning curves by {', '.join(keys)}, {title(task)}")
+
+
+def plot_comparison(
+    study: Study,
+    task: str,
+    keys: Sequence[str],
+    file: Path,
+    reference: ReferenceCurves | None = None,
+    name: str = "",
+) -> Path | None:
+    """The cells of a task that depart in some settings, and its main ones.
+
+    Where the settings include the form of the model this is the paper's Figure 2.
+
+    Returns:
+        the file, or ``None`` if no run has finished an iteration.
+    """
+    cells = [cell for cell in study.compared(keys) if cell.task == task]
+    names = {cell: _name(study, cell, keys) for cell in cells}
+    order = list(dict.fromkeys(names.values()))
+    panels = []
+    for noise in dict.fromkeys(cell.noise for cell in cells):
+        lines = [
+            cell_line(study, cell, names[cell], color(order.index(names[cell])))
+            for cell in cells
+            if cell.noise == noise
+        ]
+        authors = []
+        if reference is not None and "model.form" in keys and noise == "none":
+            for form, style in (("nonlinear", "-"), ("affine", ":")):
+                curves = reference.model_form(task, form)
+                if curves is not None:
+                    authors.append(Grey(f"authors' logs, {form}", style, curves))
+        panels.append(Panel(named(name, title(task, noise)), lines, authors))
+    return plot_panels(panels, file)
+
+
+def _name(study: Study, cell: Cell, keys: Sequence[str]) -> str:
+    return ", ".join(filter(None, (arm_label(cell.arm), study.describe(cell, keys))))
+
+
+def _time(page: Page, study: Study) -> None:
+    rows = time_rows(study)
+    if not rows:
+        return
+    page.heading(
+        "Where the time goes",
+        "Wall-clock seconds of an outer iteration in each of its phases, medians over all "
+        "iterations of the finished runs, and the mean training time per real step. The times are "
+        "those of the machine, with whatever else it did.",
+    )
+    page.text(time_table(rows))
+    page.csv("time", rows)
+
+
+def time_rows(study: Study) -> list[dict[str, Any]]:
+    """Seconds per outer iteration in each phase, for each main cell whose times are known.
+
+    The phases (those of them that the algorithm has) are medians over all outer iterations of all
+    finished runs, and ``ms_per_step`` is the training time per real step of whole runs, random data
+    included and ``evaluate`` left out. Where an algorithm has several stages there is a row for
+    each, of its iterations and real steps, and ``share`` is its part of the training time.
+    """
+    rows = []
+    phases = [phase for phase in study.facts.phases if phase in _PHASES]
+    for cell, runs in study.cells.items():
+        timed = [run for run in runs if run.finished and np.isfinite(run.milliseconds_per_step)]
+        if cell.variant or not timed:
+            continue
+        place = {"task": cell.task, "noise": cell.noise, "l1": cell.arm}
+        if not study.facts.named_stages:
+            whole = [np.full(len(run.returns), True) for run in timed]
+            rows.append({**place, "runs": len(timed), **_times(timed, whole, phases)})
+        for position, stage in enumerate(study.facts.named_stages):
+            during = [run.during(position) for run in timed]
+            if any(part.any() for part in during):
+                named = {**place, "stage": stage.name, "runs": len(timed)}
+                rows.append({**named, **_times(timed, during, phases), **_share(timed, during)})
+    return rows
+
+
+def _times(
+    runs: Sequence[Run], parts: Sequence[np.ndarray], phases: Sequence[str]
+) -> dict[str, float]:
+    """Medians over the outer iterations of these parts of the runs, and time per real step."""
+    found = {
+        phase: [run.seconds[phase][part] for run, part in zip(runs, parts, strict=True)]
+        for phase in phases
+    }
+    steps = [
+        np.diff(run.real_steps, prepend=0)[part].sum()
+        for run, part in zip(runs, parts, strict=True)
+    ]
+    seconds = [_seconds(run, part) for run, part in zip(runs, parts, strict=True)]
+    per_step = [1000 * t / n if n else math.nan for t, n in zip(seconds, steps, strict=True)]
+    return {
+        **{phase: float(np.median(np.concatenate(times))) for phase, times in found.items()},
+        "ms_per_step": float(np.mean(per_step)),
+    }
+
+
+def _share(runs: Sequence[Run], parts: Sequence[np.ndarray]) -> dict[str, float]:
+    shares = [_seconds(run, part) / _seconds(run) for run, part in zip(runs, parts, strict=True)]
+    return {"share": float(np.mean(shares))}
+
+
+def _seconds(run: Run, part: np.ndarray | slice = slice(None)) -> float:
+    return float(run.training_seconds[part].sum())
+
+
+def time_table(rows: list[dict[str, Any]]) -> str:
+    """The rows as Markdown."""
+    return markdown(
+        [
+            {
+                "task": row["task"],
+                "noise": row["noise"],
+                "L1": row["l1"],
+                "stage": row.get("stage", ""),
+                "runs": str(row["runs"]),
+                **{f"{w}, s": number(row[phase]) for phase, w in _PHASES.items() if phase in row},
+                "training, ms per real step": number(row["ms_per_step"]),
+                "share of the training": f"{row['share']:.0%}" if "share" in row else "",
+            }
+            for row in rows
+        ]
+    )
