@@ -12,11 +12,14 @@ from benchmarks import (
     collection,
     env_stepping,
     fitting,
+    imagination,
     jacobian,
     l1_scaling,
+    metrpo_iteration,
     planning,
     planning_precision,
     shooting,
+    trpo,
 )
 from benchmarks.tables import Table
 
@@ -33,6 +36,9 @@ BENCHMARKS: dict[str, tuple[int, int, Callable[[int], Table]]] = {
     "planning_precision": (planning_precision.THREADS, 4, planning_precision.table),
     "shooting": (shooting.THREADS, 9, shooting.table),
     "fitting": (fitting.THREADS, 9, fitting.table),
+    "imagination": (imagination.THREADS, 9, imagination.table),
+    "trpo": (trpo.THREADS, 15, trpo.table),
+    "metrpo_iteration": (metrpo_iteration.THREADS, 5, metrpo_iteration.table),
 }
 
 
@@ -41,6 +47,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS))
     parser.add_argument("--repetitions", type=int, help="measurements of each case")
+    parser.add_argument(
+        "--quick", action="store_const", const=1, dest="repetitions", help="one of each"
+    )
     parser.add_argument("--threads", type=int, help="threads of torch, for all tables")
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder for the files")
     arguments = parser.parse_args()

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
-from torch import Tensor
 
 from benchmarks.tables import Table
 from benchmarks.timing import Row, interleave, ratio, spread
 from torchrl_l1.control import ActionJacobian, L1Config, augment, init
-from torchrl_l1.control.layout import make_step
+from torchrl_l1.control.layout import Step, make_step
 from torchrl_l1.dynamics import EnsembleDynamics
 
 SIZES = (1, 6, 25, 64, 256, 1024, 4096)
@@ -62,10 +62,10 @@ def run(repetitions: int, threads: tuple[int, ...] = THREAD_COUNTS) -> list[Row]
             x, u_rl = torch.randn(size, n), 2 * torch.rand(size, m) - 1
             state = in_blocks(init([size], n, m), x, u_rl)[1]
             arguments = state, x + 0.1 * torch.randn_like(x), u_rl.flip(-1)
-            cases: dict[str, Callable[[], tuple[Tensor, ...]]] = {
-                "apart": lambda a=arguments: augment(config, apart, *a),
-                "whole": lambda a=arguments: augment(config, joined, *a),
-                "blocks": lambda a=arguments: in_blocks(*a),
+            cases: dict[str, Callable[[], Step]] = {
+                "apart": partial(augment, config, apart, *arguments),
+                "whole": partial(augment, config, joined, *arguments),
+                "blocks": partial(in_blocks, *arguments),
             }
             executed = [case()[0] for case in cases.values()]
             for other in executed[1:]:

@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Hashable, Mapping
 from typing import TypeVar
 
+import torch
+
 Row = dict[str, str | int | float]
 
 Case = TypeVar("Case", bound=Hashable)
@@ -18,6 +20,7 @@ def interleave(
     *,
     shortest: float = 0.02,
     warmup: int = 2,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> dict[Case, list[float]]:
     """Seconds per call of each case.
 
@@ -26,6 +29,7 @@ def interleave(
         repetitions: measurements of each case; the cases take turns.
         shortest: a measurement repeats its call until it takes about this many seconds.
         warmup: unmeasured calls of each case before the first measurement.
+        clock: seconds so far, on the wall by default.
 
     Returns:
         ``repetitions`` values for each case, in the order in which they were measured.
@@ -34,19 +38,24 @@ def interleave(
     for name, case in cases.items():
         for _ in range(warmup):
             case()
-        calls[name] = max(1, round(shortest / max(_seconds(case, 1), 1e-9)))
+        calls[name] = max(1, round(shortest / max(_seconds(case, 1, clock), 1e-9)))
     measured: dict[Case, list[float]] = {name: [] for name in cases}
     for _ in range(repetitions):
         for name, case in cases.items():
-            measured[name].append(_seconds(case, calls[name]))
+            measured[name].append(_seconds(case, calls[name], clock))
     return measured
 
 
-def _seconds(case: Callable[[], object], calls: int) -> float:
-    start = time.perf_counter()
+def undisturbed_clock() -> Callable[[], float]:
+    """Of the process with one thread; with more of them, which also wait, that on the wall."""
+    return time.process_time if torch.get_num_threads() == 1 else time.perf_counter
+
+
+def _seconds(case: Callable[[], object], calls: int, clock: Callable[[], float]) -> float:
+    start = clock()
     for _ in range(calls):
         case()
-    return (time.perf_counter() - start) / calls
+    return (clock() - start) / calls
 
 
 def spread(name: str, values: list[float]) -> Row:

@@ -113,3 +113,22 @@ def test_reset_std_touches_nothing_else() -> None:
         assert torch.equal(old, new)
     with pytest.raises(ValueError, match="positive"):
         policy.reset_std(0.0)
+
+
+@pytest.mark.parametrize("hidden", [(), (8,), (16, 8)])
+def test_sampler_draws_what_the_policy_does_and_does_not_follow_it(hidden: tuple[int, ...]) -> None:
+    torch.manual_seed(0)
+    policy = GaussianPolicy(4, 2, hidden, std=0.5)
+    observation = 3 + 2 * torch.randn(50, 4)
+    policy.normalizer.fit(observation)
+    sampler = policy.sampler()
+    torch.manual_seed(1)
+    expected = policy.sample(observation).detach()
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter.mul_(3)
+    policy.normalizer.std.mul_(2)
+    torch.manual_seed(1)
+    found = sampler(observation)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+    assert not found.requires_grad

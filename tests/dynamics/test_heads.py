@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from torchrl_l1.control import ActionJacobian
@@ -17,6 +17,7 @@ from torchrl_l1.dynamics import (
     EnsembleDynamicsLoss,
     FitConfig,
     GaussianHead,
+    Head,
     fit_ensemble,
     make_dynamics,
     make_head,
@@ -70,18 +71,51 @@ def test_gradients_under_transforms_are_the_same() -> None:
     torch.testing.assert_close(each, expected)
 
 
-def test_gradients_agree_with_finite_differences() -> None:
-    head = GaussianHead(2).double()
+class Loss(nn.Module):
+    """A head's loss as a module, to be called with other parameters."""
+
+    def __init__(self, head: Head) -> None:
+        super().__init__()
+        self.head = head
+
+    def forward(self, raw: Tensor, target: Tensor) -> Tensor:
+        return self.head.loss(raw, target)
+
+
+def test_first_and_second_derivatives_agree_with_finite_differences() -> None:
+    module = Loss(GaussianHead(2).double())
     raw = torch.randn(3, 2, 4, dtype=torch.float64, requires_grad=True)
     target = torch.randn(2, 2, dtype=torch.float64, requires_grad=True)
+    names = [name for name, _ in module.named_parameters()]
 
-    def loss(raw: Tensor, target: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        head.__dict__.update(min_log_variance=low, max_log_variance=high)
-        return head.loss(raw, target)
+    def loss(raw: Tensor, target: Tensor, *bounds: Tensor) -> Tensor:
+        given = dict(zip(names, bounds, strict=True))
+        return torch.func.functional_call(module, given, (raw, target))
 
-    bounds = (head.min_log_variance, head.max_log_variance)
-    assert torch.autograd.gradcheck(loss, (raw, target, *bounds))
-    assert torch.autograd.gradgradcheck(loss, (raw, target, *bounds))
+    inputs = (raw, target, *module.parameters())
+    assert torch.autograd.gradcheck(loss, inputs)
+    assert torch.autograd.gradgradcheck(loss, inputs)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("head", ["deterministic", "gaussian"])
+@given(seed=st.integers(0, 2**16), dim=st.integers(1, 4), rows=st.integers(1, 9))
+@settings(max_examples=20, deadline=None)
+def test_what_a_fit_needs_is_what_autograd_says(
+    head: str, dtype: torch.dtype, seed: int, dim: int, rows: int
+) -> None:
+    torch.manual_seed(seed)
+    one = make_head(head, dim).to(dtype)
+    raw = 2 * torch.randn(3, rows, one.out_features(dim), dtype=dtype)
+    target = torch.randn(3, rows, dim, dtype=dtype)
+    losses, gradient = one.loss_and_gradient(raw.clone(), target)
+    own = [parameter.grad.clone() for parameter in one.parameters()]
+    expected_losses, expected = Head.loss_and_gradient(one, raw, target)
+    tolerance = {"rtol": 1e-4, "atol": 1e-5} if dtype == torch.float32 else {}
+    torch.testing.assert_close(losses, expected_losses, **tolerance)
+    torch.testing.assert_close(gradient, expected, **tolerance)
+    for parameter, found in zip(one.parameters(), own, strict=True):
+        torch.testing.assert_close(found, parameter.grad, **tolerance)
 
 
 @given(

@@ -1,12 +1,16 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import CEMPlanner
 
-from torchrl_l1.dynamics import EnsembleDynamics, EnsembleModelEnv, imagine
+from torchrl_l1.dynamics import EnsembleDynamics, EnsembleModelEnv, imagine, make_dynamics
+
+Policy = Callable[[Tensor], Tensor]
 
 LOW, HIGH = torch.tensor([-1.0]), torch.tensor([1.0])
 
@@ -128,3 +132,98 @@ def test_torchrl_planner_accepts_the_model() -> None:
     )
     planner = CEMPlanner(env, planning_horizon=3, optim_steps=4, num_candidates=64, top_k=8)
     assert planner(env.reset())["action"].item() > 0.5
+
+
+def fitted_model(head: str = "deterministic", form: str = "nonlinear") -> EnsembleDynamics:
+    torch.manual_seed(0)
+    model = make_dynamics(3, 2, form, hidden=(32, 24), members=4, activation="silu", head=head)
+    model.fit_statistics(3 + torch.randn(50, 3), 2 * torch.randn(50, 2), 0.3 * torch.randn(50, 3))
+    model.box.low.fill_(2.4)
+    model.box.high.fill_(3.6)
+    model.set_elites([1, 3])
+    return model
+
+
+def stepwise(model: EnsembleDynamics, policy: Policy, start: Tensor, steps: int) -> list[Tensor]:
+    """Observations, actions, rewards and whether inside, by the definition, step by step."""
+    elites = model.elites.tolist()
+    drawn = [elites[i] for i in torch.randint(len(elites), (steps,)).tolist()]
+    x, columns = start, []
+    for member in drawn:
+        action = policy(x)
+        successor = x + model.member_change(x, action.clamp(-1, 1), member)
+        inside = model.box.contains(successor)
+        successor = torch.where(inside[:, None], successor, x)
+        columns.append((x, action, quadratic(x, action.clamp(-1, 1), successor), inside))
+        x = successor
+    return [torch.stack(column, 1) for column in zip(*columns, strict=True)]
+
+
+def quadratic(x: Tensor, u: Tensor, successor: Tensor) -> Tensor:
+    return successor.square().sum(-1) + x[..., 0] * u.square().sum(-1)
+
+
+@pytest.mark.parametrize("form", ["nonlinear", "affine"])
+@pytest.mark.parametrize("head", ["deterministic", "gaussian"])
+def test_is_the_definition_step_by_step(head: str, form: str) -> None:
+    model = fitted_model(head, form)
+    gain, start = torch.randn(3, 2), 3 + 0.2 * torch.randn(40, 3)
+    bound = torch.ones(2)
+
+    def policy(x: Tensor) -> Tensor:
+        return x @ gain + torch.randn(40, 2)
+
+    with torch.no_grad():
+        torch.manual_seed(5)
+        expected = stepwise(model, policy, start, 12)
+        torch.manual_seed(5)
+        found = imagine(model, policy, quadratic, start, 12, -bound, bound)
+    valid = found["valid"][..., 0]
+    ended = (~expected[3]).long()
+    assert torch.equal(valid, (ended.cumsum(1) - ended) == 0)
+    assert 0 < found["next", "left_box"].sum() < 40
+    pairs = [found["observation"], found["action"], found["next", "reward"][..., 0]]
+    for one, other in zip(pairs, expected[:3], strict=True):
+        torch.testing.assert_close(one[valid], other[valid], rtol=1e-4, atol=1e-5)
+        assert one.isfinite().all()
+
+
+def test_nothing_broken_outlives_the_box() -> None:
+    model = drifting_model(1e30)
+    with torch.no_grad():
+        model.network.weights[0][:, 2, 0] = torch.nan
+    found = imagine(
+        model,
+        lambda x: x[:, :1] + 0.5,
+        reward,
+        torch.zeros(3, 2),
+        4,
+        LOW,
+        HIGH,
+        lambda x: x[:, 0] > 9,
+    )
+    assert found["valid"].sum() == found["next", "left_box"].sum() == 3
+    for key in ("observation", "action", ("next", "reward"), ("next", "observation")):
+        assert found[key].isfinite().all()
+
+
+def test_hidden_layers_in_bfloat16_stay_close() -> None:
+    model, bound = fitted_model(), torch.ones(2)
+    start = 3 + 0.1 * torch.randn(40, 3)
+    paths = []
+    for precision in ("float32", "bfloat16"):
+        torch.manual_seed(1)
+        paths.append(
+            imagine(
+                model,
+                lambda x: torch.randn(40, 2),
+                quadratic,
+                start,
+                4,
+                -bound,
+                bound,
+                precision=precision,  # type: ignore[arg-type]
+            )["observation"]
+        )
+    moved = (paths[0] - start[:, None]).abs().mean()
+    assert 0 < (paths[0] - paths[1]).abs().mean() < 0.02 * moved

@@ -11,7 +11,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_l1.algorithms.policy import GaussianPolicy, make_actor
 from torchrl_l1.objectives import TRPOConfig, conjugate_gradient, trpo_step
-from torchrl_l1.objectives.trpo import _fisher_product
+from torchrl_l1.objectives.trpo import _AutogradProblem
 
 
 @given(size=st.integers(1, 12), seed=st.integers(0, 1000))
@@ -41,9 +41,7 @@ def test_fisher_product_is_that_of_a_gaussian() -> None:
     data = batch(actor.float(), 50)
     policy.double()
     data = data.double()
-    parameters = list(actor.parameters())
-    config = TRPOConfig(damping=0.0, fisher_fraction=1.0)
-    product = _fisher_product(actor, data, parameters, config)
+    product = _AutogradProblem(actor, data, TRPOConfig(fisher_fraction=1.0)).fisher_product
     # Mean linear in x: the block of each output's weights is E[x x^T] / std^2, bias included.
     x = torch.cat([data["observation"], torch.ones(50, 1).double()], dim=1)
     second_moment = x.T @ x / 50 / 0.25

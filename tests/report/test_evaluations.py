@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from torchrl_l1.report.evaluation_data import Evaluation, one_policy
 from torchrl_l1.report.evaluation_summary import summarize, summary_tables
 from torchrl_l1.report.evaluations import (
     ablation_rows,
@@ -18,6 +17,7 @@ from torchrl_l1.report.evaluations import (
     evaluation_rows,
     evaluation_table,
 )
+from torchrl_l1.report.reading import Evaluation, one_policy
 from torchrl_l1.report.runs import find_runs
 from torchrl_l1.report.study import Study, studies
 from torchrl_l1.report.training import training_row

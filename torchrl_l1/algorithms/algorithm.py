@@ -22,6 +22,7 @@ from torchrl_l1.algorithms.seeding import seed_streams
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import FitConfig, make_dynamics
+from torchrl_l1.dynamics.network import model_precision
 from torchrl_l1.envs import Perturbation, get_task
 
 DEVICES = ("cpu", "cuda", "auto")
@@ -199,7 +200,8 @@ class Algorithm(ABC):
 
     def choices(self) -> dict[str, str]:
         """What settings that say ``auto`` have become on this machine."""
-        return {"device": str(self.device)}
+        fit = model_precision(self.dynamics, self.config.fit.precision)
+        return {"device": str(self.device), "fit": fit}
 
     def weights(self) -> dict[str, dict[str, Any]]:
         """State dicts of what has been learned, by the names under which users look for them."""

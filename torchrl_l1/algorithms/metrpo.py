@@ -32,6 +32,7 @@ from torchrl_l1.algorithms.policy_improvement import (
     policy_metrics,
 )
 from torchrl_l1.control import L1Config
+from torchrl_l1.dynamics.network import model_precision
 from torchrl_l1.envs import Perturbation
 
 
@@ -144,6 +145,11 @@ class METRPO(Algorithm):
     def policies(self) -> Mapping[str, TensorDictModuleBase]:
         """What acts in real environments: the policy, its actions clipped if settings say so."""
         return {"policy": self.collection.policy}
+
+    def choices(self) -> dict[str, str]:
+        """Where and in which precision models are fitted and trajectories imagined."""
+        imagination = model_precision(self.dynamics, self.config.precision)
+        return {**super().choices(), "imagination": imagination}
 
     def weights(self) -> dict[str, dict[str, Any]]:
         """State dicts of model and policy."""

@@ -14,6 +14,7 @@ from torchrl_l1.algorithms.config import (
 )
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.objectives import TRPOConfig
+from torchrl_l1.planning import resolve_precision
 
 
 @dataclass
@@ -77,6 +78,9 @@ class METRPOConfig:
         policy: see :class:`PolicyConfig`.
         fit: see :class:`~torchrl_l1.dynamics.FitConfig`.
         trpo: see :class:`~torchrl_l1.objectives.TRPOConfig`.
+        precision: of the hidden layers in imagination: ``float32``, ``bfloat16``, or ``auto`` for
+            the faster one on this machine, see :func:`~torchrl_l1.planning.resolve_precision`.
+            That of fits is ``fit.precision``.
     """
 
     outer_iterations: int = 33
@@ -98,8 +102,10 @@ class METRPOConfig:
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     trpo: TRPOConfig = field(default_factory=TRPOConfig)
+    precision: str = "float32"
 
     def __post_init__(self) -> None:
+        resolve_precision(self.precision)
         check_choice("label", self.label, ("nominal", "executed"))
         check_choice("box_exit", self.box_exit, ("truncate", "fail"))
         check_steps("episode_steps", self.episode_steps)

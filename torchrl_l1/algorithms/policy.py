@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -68,6 +68,28 @@ class GaussianPolicy(nn.Module):
         """One action per observation: ``(..., n)`` to ``(..., m)``."""
         loc, scale = self(observation)
         return torch.addcmul(loc, scale, torch.randn_like(loc))
+
+    @torch.no_grad()
+    def sampler(self) -> Callable[[Tensor], Tensor]:
+        """What :meth:`sample` does with the parameters as they are now, for many calls.
+
+        The statistics are folded into the first layer, and nothing is prepared twice.
+        """
+        layers = [layer for layer in self.mean if isinstance(layer, nn.Linear)]
+        weights = [layer.weight.t().clone() for layer in layers]
+        biases = [layer.bias.clone() for layer in layers]
+        weights[0] /= self.normalizer.std[:, None]
+        biases[0] -= self.normalizer.mean @ weights[0]
+        std = self.log_std.exp()
+
+        @torch.no_grad()
+        def sample(observation: Tensor) -> Tensor:
+            units = torch.addmm(biases[0], observation, weights[0])
+            for bias, weight in zip(biases[1:], weights[1:], strict=True):
+                units = torch.addmm(bias, units.tanh_(), weight)
+            return units.addcmul_(std, torch.randn_like(units))
+
+        return sample
 
 
 def _normalized_linear(fan_in: int, fan_out: int, norm: float) -> nn.Linear:

@@ -16,7 +16,13 @@ from torchrl_l1.algorithms.metrpo_config import METRPOConfig
 from torchrl_l1.algorithms.policy import GaussianPolicy, make_actor
 from torchrl_l1.dynamics import EnsembleDynamics, imagine
 from torchrl_l1.envs import StartStates, Task
-from torchrl_l1.objectives import LinearFeatureBaseline, TRPOReport, trpo_step
+from torchrl_l1.objectives import (
+    LinearFeatureBaseline,
+    TRPOReport,
+    gaussian_trpo_step,
+    is_tanh_network,
+    trpo_step,
+)
 
 POLICY_METRICS: dict[str, str] = {
     "imagined/return_first": "Mean imagined return before the first TRPO step.",
@@ -54,7 +60,6 @@ class PolicyImprovement:
     ) -> None:
         self.task, self.dynamics, self.policy, self.config = task, dynamics, policy, config
         self.device = next(policy.parameters()).device
-        self.actor = make_actor(policy)
         self.baseline = LinearFeatureBaseline(task.observation_dim).to(self.device)
         self.start_states = StartStates(task)
         self.action_low, self.action_high = (
@@ -67,13 +72,14 @@ class PolicyImprovement:
         config = self.config
         trajectories = imagine(
             self.dynamics,
-            self.policy.sample,
+            self.policy.sampler(),
             self.task.imagined_reward,
             self.starts(config.imagined_steps // config.imagined_horizon, buffer),
             config.imagined_horizon,
             self.action_low,
             self.action_high,
             self.task.terminated if config.imagined_termination else None,
+            precision=config.precision,  # type: ignore[arg-type]
         )
         observation, step = trajectories["observation"], trajectories["step"]
         if config.bootstrap:
@@ -88,22 +94,26 @@ class PolicyImprovement:
             trajectories, value, last_value, config.discount, config.gae_lambda, config.box_exit
         )
         valid = trajectories["valid"].squeeze(-1)
-        samples = TensorDict(
-            {
-                "observation": observation[valid],
-                "action": trajectories["action"][valid],
-                "advantage": _standardize(advantage[valid]),
-            },
-            batch_size=[int(valid.sum())],
-        )
-        report = trpo_step(self.actor, samples, config.trpo)
-        self.baseline.fit(observation[valid], step[valid], target[valid])
+        seen = observation[valid]
+        report = self._improve(seen, trajectories["action"][valid], _standardize(advantage[valid]))
+        self.baseline.fit(seen, step[valid], target[valid])
         rewards = trajectories["next", "reward"] * trajectories["valid"]
         return PolicyStep(
             report,
             imagined_return=rewards.sum(1).mean().item(),
             left_box=trajectories["next", "left_box"].any(1).float().mean().item(),
         )
+
+    def _improve(self, observation: Tensor, action: Tensor, advantage: Tensor) -> TRPOReport:
+        policy, config = self.policy, self.config.trpo
+        if type(policy) is GaussianPolicy and is_tanh_network(policy.mean):
+            inputs = policy.normalizer.normalize(observation)
+            return gaussian_trpo_step(
+                policy.mean, policy.log_std, inputs, action, advantage, config
+            )
+        columns = {"observation": observation, "action": action, "advantage": advantage}
+        samples = TensorDict(columns, batch_size=observation.shape[:1])
+        return trpo_step(make_actor(policy), samples, config)
 
     def starts(self, count: int, buffer: ReplayBuffer) -> Tensor:
         """First observations of imagined trajectories ``(count, n)``."""

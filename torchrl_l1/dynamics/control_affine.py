@@ -40,16 +40,13 @@ class ControlAffineDynamics(EnsembleDynamics):
         n, m = self.observation_dim, self.action_dim
         return EnsembleMLP(n, (1 + m) * self.head.out_features(n), hidden, members, activation)
 
-    def raw(self, inputs: Tensor) -> Tensor:
-        """As in :class:`EnsembleDynamics`: all of it is affine in the action, mean or not."""
-        observation, action = self._split(inputs)
-        return _affine(*self._coefficients(self.network(observation)), action)
+    def network_inputs(self, inputs: Tensor) -> Tensor:
+        """What of :meth:`normalize_inputs` the network reads: the observation."""
+        return self._split(inputs)[0]
 
-    def raw_member(self, inputs: Tensor, member: int) -> Tensor:
-        """As :meth:`raw` for one member: ``(B, n + m)`` to ``(B, out)``."""
-        observation, action = self._split(inputs)
-        coefficients = self._coefficients(self.network.forward_member(observation, member))
-        return _affine(*coefficients, action)
+    def raw_from_output(self, output: Tensor, inputs: Tensor) -> Tensor:
+        """What the head makes sense of: all of it is affine in the action, mean or not."""
+        return _affine(*self._coefficients(output), self._split(inputs)[1])
 
     def value_and_jacobian(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Mean predicted change and its derivative with respect to the action, in raw units.

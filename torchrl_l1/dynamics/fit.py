@@ -14,6 +14,8 @@ from torchrl.data import ReplayBuffer
 from torchrl.objectives.common import LossModule
 
 from torchrl_l1.dynamics.model import EnsembleDynamics
+from torchrl_l1.dynamics.network import model_precision, resolve_precision
+from torchrl_l1.dynamics.training_step import TrainingStep
 
 
 @dataclass
@@ -39,6 +41,10 @@ class FitConfig:
             as many drawn with replacement, anew at each fit. They are validated on the same.
         elites: number of members kept as the model's elites after the fit, those of the lowest
             validation loss; if null the model's elites stay as they are.
+        precision: of the products of hidden units and of their gradients, ``float32``,
+            ``bfloat16``, or ``auto`` for the faster one on this machine, see
+            :func:`~torchrl_l1.planning.resolve_precision`. Weights, moments of the optimizer and
+            validation are always float32.
     """
 
     learning_rate: float = 1e-3
@@ -52,6 +58,7 @@ class FitConfig:
     weight_decay: list[float] = field(default_factory=list)
     bootstrap: bool = False
     elites: int | None = None
+    precision: str = "float32"
 
     def __post_init__(self) -> None:
         for name in ("batch_size", "max_epochs", "max_gradient_steps", "patience"):
@@ -75,6 +82,7 @@ class FitConfig:
             )
         if self.elites is not None and self.elites < 1:
             raise ValueError(f"fit.elites must be at least 1 or null, got {self.elites}")
+        resolve_precision(self.precision, name="fit.precision")
 
 
 class EnsembleDynamicsLoss(LossModule):
@@ -233,6 +241,11 @@ def fit_ensemble(
     inputs = dynamics.normalize_inputs(train["observation"], train["action"])
     target = dynamics.change_normalizer.normalize(change)
     loss = EnsembleDynamicsLoss(dynamics)
+    training_step = TrainingStep(
+        dynamics,
+        model_precision(dynamics, config.precision),
+        _decay(config, len(dynamics.network.weights), train.shape[0]),
+    )
     members, size = dynamics.members, train.shape[0]
     batch_size = min(config.batch_size, size)
     batches = size // batch_size
@@ -249,16 +262,10 @@ def fit_ensemble(
             index = order[:, batch * batch_size : (batch + 1) * batch_size]
             if resample is not None:
                 index = resample.gather(1, index)
-            objective, member_loss = loss.objective(_rows(inputs, index), _rows(target, index))
-            running += member_loss.detach().sum()
-            if config.weight_penalty:
-                objective = objective + config.weight_penalty * _penalty(dynamics) / size
+            running += training_step(_rows(inputs, index), _rows(target, index)).sum()
             decay = 1 - (1 - config.final_learning_rate_fraction) * steps / planned
             for group in optimizer.param_groups:
                 group["lr"] = config.learning_rate * decay
-            optimizer.zero_grad(set_to_none=True)
-            objective.backward()
-            _add_decay(dynamics, config.weight_decay)
             optimizer.step()
             steps += 1
             if steps == config.max_gradient_steps:
@@ -311,17 +318,13 @@ def _copy(parameters: Sequence[Tensor]) -> list[Tensor]:
     return [parameter.detach().clone() for parameter in parameters]
 
 
-@torch.no_grad()
-def _add_decay(dynamics: EnsembleDynamics, coefficients: Sequence[float]) -> None:
-    """Add the gradients of the squared weights, which are known without a backward pass."""
-    if coefficients:
-        for coefficient, weight in zip(coefficients, dynamics.network.weights, strict=True):
-            if weight.grad is not None:
-                weight.grad.add_(weight, alpha=coefficient)
-
-
-def _penalty(dynamics: EnsembleDynamics) -> Tensor:
-    return 0.5 * torch.stack([w.square().sum() for w in dynamics.network.weights[:-1]]).sum()
+def _decay(config: FitConfig, layers: int, size: int) -> list[float]:
+    """Coefficients of half the squared weights, one per layer, or none."""
+    if not config.weight_decay and not config.weight_penalty:
+        return []
+    hidden = config.weight_penalty / size
+    given = config.weight_decay or [0.0] * layers
+    return [coefficient + hidden for coefficient in given[:-1]] + given[-1:]
 
 
 def _split(buffer: ReplayBuffer, action_key: str) -> tuple[TensorDict, TensorDict]:

@@ -36,6 +36,29 @@ class Head(nn.Module, ABC):
         """What the head's own parameters add to the objective of a fit, once per ensemble."""
         return 0.0
 
+    def loss_and_gradient(self, raw: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """Losses of the members, and what a fit needs of the gradients of its objective.
+
+        The objective is the sum of the members' losses and the penalty. Autograd differentiates
+        it; a head that knows its gradients may say them here.
+
+        Args:
+            raw: raw outputs ``(E, B, out)``, without a graph.
+            target: ``(E, B, dim)``.
+
+        Returns:
+            losses ``(E,)`` and the gradient by the raw outputs. Those by the head's own
+            parameters are in their ``grad``, instead of what was there.
+        """
+        for parameter in self.parameters():
+            parameter.grad = None
+        with torch.enable_grad():
+            raw = raw.detach().requires_grad_()
+            losses = self.loss(raw, target).mean(-1)
+            (losses.sum() + self.penalty()).backward()
+        assert raw.grad is not None
+        return losses.detach(), raw.grad
+
 
 class DeterministicHead(Head):
     """The raw output is the predicted mean; trained with the mean squared error."""
@@ -51,6 +74,13 @@ class DeterministicHead(Head):
     def standard_deviation(self, raw: Tensor) -> Tensor:
         """Zero: the prediction is a point."""
         return torch.zeros_like(raw)
+
+    def loss_and_gradient(self, raw: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """See :meth:`Head.loss_and_gradient`."""
+        error = raw - target
+        losses = error.square().mean(-1).mean(-1)
+        rows, columns = error.shape[-2:]
+        return losses, error.mul_(2 * (losses.new_ones(()) / rows / columns))
 
 
 class GaussianHead(Head):
@@ -141,13 +171,56 @@ class GaussianHead(Head):
 
     def loss(self, raw: Tensor, target: Tensor) -> Tensor:
         """Negative log-likelihood in nats, averaged over the target's columns."""
-        variance = self.variance(raw)
-        weighted = (target - raw[..., : self.dim]).square() / variance
-        return 0.5 * ((weighted + variance.log()).mean(-1) + math.log(2 * math.pi))
+        share = torch.sigmoid(raw[..., self.dim :] - self.max_log_variance)
+        variance = torch.addcmul(self.min_log_variance.exp(), share, self.max_log_variance.exp())
+        error = target - raw[..., : self.dim]
+        squared = error * (error * variance.reciprocal())
+        return _nats(squared, variance)
+
+    def loss_and_gradient(self, raw: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        r"""See :meth:`Head.loss_and_gradient`.
+
+        With :math:`s = 1 / (1 + e^{h - v})`, variance :math:`V = e^\ell + s e^h` and error
+        :math:`d` the gradients are
+
+        .. math::
+            \frac{\partial}{\partial \mu} = -\frac{d}{V}, \quad
+            \frac{\partial}{\partial V} = \frac{1 - d^2 / V}{2 V}, \quad
+            \frac{\partial V}{\partial v} = s (1 - s) e^h, \quad
+            \frac{\partial V}{\partial h} = s^2 e^h, \quad
+            \frac{\partial V}{\partial \ell} = e^\ell.
+
+        Left to autograd, the dozen small operations of the loss take a tenth of a fit's time.
+        """
+        low, high = self.min_log_variance.detach(), self.max_log_variance.detach()
+        share = torch.sigmoid(raw[..., self.dim :] - high)
+        least, scale = low.exp(), high.exp()
+        variance = torch.addcmul(least, share, scale)
+        precision = variance.reciprocal()
+        error = target - raw[..., : self.dim]
+        weighted = error * precision
+        squared = error * weighted
+        losses = _nats(squared, variance).mean(-1)
+        each = losses.new_ones(()) / raw.shape[-2] / self.dim
+        by_variance = (1 - squared) * precision * (0.5 * each)
+        by_share = by_variance * share * scale
+        by_raw = by_share - by_share * share
+        own = {
+            self.min_log_variance: by_variance.sum((0, 1)) * least - self.bound_penalty,
+            self.max_log_variance: (by_share - by_raw).sum((0, 1)) + self.bound_penalty,
+        }
+        for parameter, gradient in own.items():
+            parameter.grad = gradient if parameter.requires_grad else None
+        return losses, torch.cat([weighted * -each, by_raw], -1)
 
     def penalty(self) -> Tensor:
         """``bound_penalty`` times the sum of the distances between upper and lower bounds."""
         return self.bound_penalty * (self.max_log_variance.sum() - self.min_log_variance.sum())
+
+
+def _nats(squared: Tensor, variance: Tensor) -> Tensor:
+    """From squared errors in units of the variance."""
+    return 0.5 * ((squared + variance.log()).mean(-1) + math.log(2 * math.pi))
 
 
 def make_head(name: str, dim: int) -> Head:

@@ -12,6 +12,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_l1.dynamics.model import EnsembleDynamics
+from torchrl_l1.dynamics.network import ForwardPass, PlanningNetwork, Precision
 
 
 @torch.no_grad()
@@ -24,6 +25,7 @@ def imagine(
     action_low: Tensor,
     action_high: Tensor,
     terminated: Callable[[Tensor], Tensor] | None = None,
+    precision: Precision = "float32",
 ) -> TensorDict:
     """Roll a policy out in the ensemble, one random member per step for the whole batch.
 
@@ -31,17 +33,22 @@ def imagine(
     outside, and rewards imagined there grow without bound. Model and reward see the clipped
     action; what is stored is the policy's sample, whose likelihood the policy gradient needs.
 
+    The model is copied once, with its statistics folded into the weights; rewards and ends are
+    computed for all steps at once.
+
     Args:
         dynamics: the model; one of its elites is drawn at each step (arXiv 1802.10592), and its
             mean taken.
         policy: maps observations ``(B, n)`` to sampled actions ``(B, m)``.
-        reward: maps observation, clipped action and next observation to ``(B,)``.
+        reward: maps observations, clipped actions and next observations, in rows, to one number
+            per row.
         start: first observations ``(B, n)``.
         horizon: number of steps, T.
         action_low: lower bounds ``(m,)``.
         action_high: upper bounds ``(m,)``.
-        terminated: whether the task ends in a next observation, ``(B, n)`` to ``(B,)``; by
+        terminated: whether the task ends in a next observation, ``(rows, n)`` to ``(rows,)``; by
             default it never does.
+        precision: of the hidden layers, see :class:`~torchrl_l1.planning.PlanningNetwork`.
 
     Returns:
         trajectories of batch size ``[B, T]`` with ``observation``, ``action``, ``step``
@@ -50,27 +57,44 @@ def imagine(
         step that is ``done`` is not valid and means nothing.
     """
     batch, device = start.shape[0], start.device
-    elites = dynamics.elites.tolist()
-    members = [elites[i] for i in torch.randint(len(elites), (horizon,)).tolist()]
-    observations = start.new_empty(horizon + 1, batch, start.shape[-1])
-    actions = start.new_empty(horizon, batch, action_low.shape[-1])
-    rewards = start.new_empty(horizon, batch)
-    inside = torch.empty(horizon, batch, dtype=torch.bool, device=device)
-    fallen = torch.zeros_like(inside)
+    n, m = dynamics.observation_dim, dynamics.action_dim
+    network = PlanningNetwork.from_dynamics(dynamics, precision)
+    drawn = torch.randint(network.members, (horizon,)).tolist()
+    memory: dict[tuple[torch.dtype, int], Tensor] = {}
+    passes = {member: _forward_pass(network, batch, member, memory) for member in set(drawn)}
+    observations = start.new_empty(horizon + 1, batch, n)
+    predicted = start.new_empty(horizon, batch, n)
+    actions = start.new_empty(horizon, batch, m)
+    inputs = network.bias.new_empty(batch, n + m)
+    box = dynamics.box
     observations[0] = observation = start
-    for t, member in enumerate(members):
-        actions[t] = action = policy(observation)
-        clipped = action.clamp(action_low, action_high)
-        successor = observation + dynamics.member_change(observation, clipped, member)
-        inside[t] = within = dynamics.box.contains(successor)
-        # A trajectory that left stays where it last was inside, so that nothing overflows, and is
-        # rewarded for that: outside, neither state nor reward mean anything.
-        successor = torch.where(within[:, None], successor, observation)
-        rewards[t] = reward(observation, clipped, successor)
-        if terminated is not None:
-            fallen[t] = terminated(successor)
-        observation = successor
-        observations[t + 1] = observation
+    for t, member in enumerate(drawn):
+        actions[t] = policy(observation)
+        inputs[:, :n] = observation
+        inputs[:, n:] = actions[t].clamp(action_low, action_high)
+        change = passes[member](inputs)[:, :n]
+        torch.addcmul(
+            observation + network.change_mean, change, network.change_std, out=predicted[t]
+        )
+        # Clamped for now, so that nothing overflows.
+        observation = torch.clamp(predicted[t], box.low, box.high, out=observations[t + 1])
+    inside = (predicted == observations[1:]).all(-1)  # NaN is not
+    if not inside.all():
+        # A trajectory that left stays where it last was inside, with what it did there: outside,
+        # neither state nor reward mean anything.
+        last = inside.cumprod(0).sum(0)
+        place = torch.arange(horizon + 1, device=device)[:, None].minimum(last)[..., None]
+        observations = observations.gather(0, place.expand(-1, -1, n))
+        actions = actions.gather(0, place[:-1].expand(-1, -1, m))
+    successors = observations[1:].flatten(0, 1)
+    rewards = reward(
+        observations[:-1].flatten(0, 1),
+        actions.flatten(0, 1).clamp(action_low, action_high),
+        successors,
+    ).unflatten(0, (horizon, batch))
+    fallen = torch.zeros_like(inside)
+    if terminated is not None:
+        fallen = terminated(successors).unflatten(0, (horizon, batch))
     ended = (~inside | fallen).long()
     valid = (ended.cumsum(0) - ended) == 0
     done = valid & ended.bool()
@@ -90,6 +114,18 @@ def imagine(
         },
     }
     return TensorDict(columns, batch_size=[horizon, batch]).transpose(0, 1)
+
+
+def _forward_pass(
+    network: PlanningNetwork,
+    batch: int,
+    member: int,
+    memory: dict[tuple[torch.dtype, int], Tensor],
+) -> ForwardPass:
+    """The pass of one member alone."""
+    rows = [0] * network.members
+    rows[member] = batch
+    return ForwardPass(network, rows, memory=memory)
 
 
 RewardFunction = Callable[[Tensor, Tensor, Tensor], Tensor]

@@ -131,11 +131,20 @@ class EnsembleDynamics(nn.Module):
         Returns:
             ``(E, B, out)``, normalised units.
         """
-        return self.network(inputs)
+        return self.raw_from_output(self.network(self.network_inputs(inputs)), inputs)
 
     def raw_member(self, inputs: Tensor, member: int) -> Tensor:
         """As :meth:`raw` for one member: ``(B, n + m)`` to ``(B, out)``."""
-        return self.network.forward_member(inputs, member)
+        output = self.network.forward_member(self.network_inputs(inputs), member)
+        return self.raw_from_output(output, inputs)
+
+    def network_inputs(self, inputs: Tensor) -> Tensor:
+        """What of :meth:`normalize_inputs` the network reads: all of it."""
+        return inputs
+
+    def raw_from_output(self, output: Tensor, inputs: Tensor) -> Tensor:
+        """What the head makes sense of, from the network's output: the same."""
+        return output
 
     def member_changes(self, observation: Tensor, action: Tensor) -> Tensor:
         """Predicted change of every member: ``(..., n)`` and ``(..., m)`` to ``(E, ..., n)``."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torch.distributions import Distribution, kl_divergence
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
+from torch.nn.utils import parameters_to_vector
 
 
 @dataclass
@@ -84,6 +85,28 @@ def conjugate_gradient(
     return x
 
 
+class TrustRegionProblem(Protocol):
+    """What a step needs to know of a policy and its samples.
+
+    Attributes:
+        parameters: those that a step changes, in place.
+    """
+
+    parameters: list[Tensor]
+
+    def gradient(self) -> Tensor:
+        """Gradient of the surrogate at the parameters before the step, flat ``(d,)``."""
+        ...
+
+    def fisher_product(self, vector: Tensor) -> Tensor:
+        """Product of the Fisher matrix before the step and a vector ``(d,)``."""
+        ...
+
+    def evaluate(self) -> tuple[Tensor, Tensor]:
+        """Improvement of the surrogate and mean KL divergence at the present parameters."""
+        ...
+
+
 def trpo_step(
     actor: ProbabilisticTensorDictSequential, data: TensorDictBase, config: TRPOConfig
 ) -> TRPOReport:
@@ -92,7 +115,8 @@ def trpo_step(
     The direction is the natural gradient of the importance-weighted surrogate; the step length
     starts at the trust region's edge and is shortened until both the surrogate improves as it
     should and the mean KL divergence stays within bounds. If no candidate passes, the
-    parameters stay as they were.
+    parameters stay as they were. :func:`gaussian_trpo_step` does the same faster for one kind of
+    policy.
 
     Args:
         actor: stochastic policy with a closed-form KL divergence, e.g. Gaussian.
@@ -103,64 +127,102 @@ def trpo_step(
     Raises:
         ValueError: if the advantages are not finite.
     """
-    advantage = data["advantage"].squeeze(-1)
+    return take_step(_AutogradProblem(actor, data, config), data["advantage"], config)
+
+
+def take_step(problem: TrustRegionProblem, advantage: Tensor, config: TRPOConfig) -> TRPOReport:
+    """The step of :func:`trpo_step` for whatever can tell gradients and Fisher products.
+
+    Args:
+        problem: its parameters are changed in place.
+        advantage: of the samples, of any shape, to be checked.
+        config: settings.
+
+    Raises:
+        ValueError: if the advantages are not finite.
+    """
     if not torch.isfinite(advantage).all():
         raise ValueError("TRPO: non-finite advantages; check rewards and value estimates")
-    parameters = [p for p in actor.parameters() if p.requires_grad]
-    with torch.no_grad():
-        old = actor.get_dist(data)
-        old_log_prob = old.log_prob(data["action"])
 
-    def surrogate(new: Distribution) -> Tensor:
-        return ((new.log_prob(data["action"]) - old_log_prob).exp() * advantage).mean()
+    def product(vector: Tensor) -> Tensor:
+        return problem.fisher_product(vector) + config.damping * vector
 
-    gradient = _flat_gradient(surrogate(actor.get_dist(data)), parameters).detach()
-    fisher_product = _fisher_product(actor, data, parameters, config)
-    direction = conjugate_gradient(fisher_product, gradient, config.cg_iterations)
-    curvature = direction @ fisher_product(direction)
+    parameters = problem.parameters
+    gradient = problem.gradient()
+    direction = conjugate_gradient(product, gradient, config.cg_iterations)
+    curvature = direction @ product(direction)
     if not (torch.isfinite(curvature) and curvature > 0):
         return TRPOReport(improvement=0.0, kl=0.0, accepted=False, backtracks=0)
     full_step = (2 * config.max_kl / curvature).sqrt() * direction
     start = parameters_to_vector(parameters).detach()
     expected = gradient @ full_step
     with torch.no_grad():
-        before = surrogate(old)
         for trial in range(config.max_backtracks):
             ratio = config.backtrack_ratio**trial
-            vector_to_parameters(start + ratio * full_step, parameters)
-            new = actor.get_dist(data)
-            improvement = surrogate(new) - before
-            kl = kl_divergence(old, new).mean()
+            _write(start + ratio * full_step, parameters)
+            improvement, kl = problem.evaluate()
             # NaN fails both comparisons, so a broken candidate is never accepted.
             enough = improvement > config.accept_ratio * ratio * expected
             if enough and kl <= config.max_kl:
                 return TRPOReport(improvement.item(), kl.item(), True, trial)
-        vector_to_parameters(start, parameters)
+        _write(start, parameters)
     return TRPOReport(improvement=0.0, kl=0.0, accepted=False, backtracks=config.max_backtracks)
+
+
+def _write(vector: Tensor, parameters: list[Tensor]) -> None:
+    for part, parameter in zip(
+        vector.split([p.numel() for p in parameters]), parameters, strict=True
+    ):
+        parameter.copy_(part.view_as(parameter))
+
+
+class _AutogradProblem:
+    """A problem whose derivatives are autograd's, for any actor."""
+
+    def __init__(
+        self, actor: ProbabilisticTensorDictSequential, data: TensorDictBase, config: TRPOConfig
+    ) -> None:
+        self.actor, self.data, self.config = actor, data, config
+        self.parameters = [p for p in actor.parameters() if p.requires_grad]
+        with torch.no_grad():
+            self.old = actor.get_dist(data)
+            self.old_log_prob = self.old.log_prob(data["action"])
+            self.before = self._surrogate(self.old)
+        self._divergence_gradient: Tensor | None = None
+
+    def gradient(self) -> Tensor:
+        surrogate = self._surrogate(self.actor.get_dist(self.data))
+        return _flat_gradient(surrogate, self.parameters).detach()
+
+    def fisher_product(self, vector: Tensor) -> Tensor:
+        """The Hessian of the mean KL divergence, on some of the samples."""
+        if self._divergence_gradient is None:
+            states = self.data[:: fisher_stride(self.config)]
+            with torch.no_grad():
+                fixed = self.actor.get_dist(states)
+            divergence = kl_divergence(fixed, self.actor.get_dist(states)).mean()
+            self._divergence_gradient = _flat_gradient(
+                divergence, self.parameters, create_graph=True
+            )
+        products = torch.autograd.grad(
+            self._divergence_gradient @ vector, self.parameters, retain_graph=True
+        )
+        return torch.cat([part.reshape(-1) for part in products])
+
+    def evaluate(self) -> tuple[Tensor, Tensor]:
+        new = self.actor.get_dist(self.data)
+        return self._surrogate(new) - self.before, kl_divergence(self.old, new).mean()
+
+    def _surrogate(self, new: Distribution) -> Tensor:
+        ratio = (new.log_prob(self.data["action"]) - self.old_log_prob).exp()
+        return (ratio * self.data["advantage"].squeeze(-1)).mean()
+
+
+def fisher_stride(config: TRPOConfig) -> int:
+    """The Fisher matrix is estimated on every so manieth sample."""
+    return max(1, round(1 / config.fisher_fraction))
 
 
 def _flat_gradient(scalar: Tensor, parameters: list[Tensor], create_graph: bool = False) -> Tensor:
     gradients = torch.autograd.grad(scalar, parameters, create_graph=create_graph)
     return torch.cat([gradient.reshape(-1) for gradient in gradients])
-
-
-def _fisher_product(
-    actor: ProbabilisticTensorDictSequential,
-    data: TensorDictBase,
-    parameters: list[Tensor],
-    config: TRPOConfig,
-) -> Callable[[Tensor], Tensor]:
-    """``v -> (F + damping I) v``: the Hessian of the mean KL at the current parameters."""
-    stride = max(1, round(1 / config.fisher_fraction))
-    states = data[::stride]
-    with torch.no_grad():
-        fixed = actor.get_dist(states)
-    divergence = kl_divergence(fixed, actor.get_dist(states)).mean()
-    gradient = _flat_gradient(divergence, parameters, create_graph=True)
-
-    def product(vector: Tensor) -> Tensor:
-        hessian_vector = torch.autograd.grad(gradient @ vector, parameters, retain_graph=True)
-        flat = torch.cat([part.reshape(-1) for part in hessian_vector])
-        return flat + config.damping * vector
-
-    return product

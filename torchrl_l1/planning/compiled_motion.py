@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchrl_l1.compilation import CompileMode, compiled
-from torchrl_l1.planning.network import PlanningNetwork, affine_output
+from torchrl_l1.dynamics.network import PlanningNetwork, affine_output
 from torchrl_l1.planning.particles import Draws, Predict, Propagation
 
 _Group = tuple[int, int, int]

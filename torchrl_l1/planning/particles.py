@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchrl_l1.planning.network import ForwardPass, PlanningNetwork
+from torchrl_l1.dynamics.network import ForwardPass, PlanningNetwork
 
 Scenarios = tuple[Tensor, Tensor]
 """Members ``(H, P)`` and noise ``(H, n, P)`` that the particles of all candidates draw."""

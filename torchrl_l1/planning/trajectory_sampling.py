@@ -11,13 +11,13 @@ from torch import Tensor
 
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.dynamics import EnsembleDynamics
-from torchrl_l1.planning.compiled_motion import compiled_predictor, resolve_compilation
-from torchrl_l1.planning.network import (
+from torchrl_l1.dynamics.network import (
     PlanningNetwork,
     Precision,
-    planning_precision,
+    model_precision,
     resolve_precision,
 )
+from torchrl_l1.planning.compiled_motion import compiled_predictor, resolve_compilation
 from torchrl_l1.planning.particles import (
     Draws,
     Propagation,
@@ -200,7 +200,7 @@ class TrajectorySampler:
             plans = "compiled"
             if self.compile == "auto":
                 plans += ", or eager if compiling fails"
-        return {"precision": planning_precision(self.dynamics, self.precision), "plans": plans}
+        return {"precision": model_precision(self.dynamics, self.precision), "plans": plans}
 
     def evaluator(self, observation: Tensor, generator: torch.Generator | None = None) -> Evaluate:
         """Returns ``(N, C)`` of sequences ``(N, C, H, m)`` from observations ``(N, n)``."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from torchrl_l1.report.build import report
-from torchrl_l1.report.evaluation_data import Evaluation
 from torchrl_l1.report.published import (
     Curves,
     PublishedCell,
@@ -11,6 +10,7 @@ from torchrl_l1.report.published import (
     published_cell,
     published_cells,
 )
+from torchrl_l1.report.reading import Evaluation
 from torchrl_l1.report.runs import Run, find_runs
 from torchrl_l1.report.study import Cell, Study
 

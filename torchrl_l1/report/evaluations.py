@@ -10,7 +10,6 @@ import numpy as np
 from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.matrix import undisturbed
-from torchrl_l1.report.evaluation_data import Evaluation, condition_columns
 from torchrl_l1.report.evaluation_figures import (
     PHASES,
     plot_ablation,
@@ -30,6 +29,7 @@ from torchrl_l1.report.page import (
     return_text,
 )
 from torchrl_l1.report.published import published_cell
+from torchrl_l1.report.reading import Evaluation, condition_columns
 from torchrl_l1.report.runs import Run
 from torchrl_l1.report.statistics import difference_summary, mean_interval
 from torchrl_l1.report.study import Study, noise_order, variant_text

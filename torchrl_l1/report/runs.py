@@ -14,9 +14,16 @@ import numpy as np
 from torchrl_l1.algorithms.facts import MEASURING, WINDOW
 from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.run_directory import RunDirectory, run_directories
-from torchrl_l1.report.evaluation_data import Evaluation, distinct_policies, read_evaluations
 from torchrl_l1.report.identity import Identity, facts, identify
-from torchrl_l1.report.reading import SIGNALS, read_metrics, read_seconds, read_versions
+from torchrl_l1.report.reading import (
+    SIGNALS,
+    Evaluation,
+    distinct_policies,
+    read_evaluations,
+    read_metrics,
+    read_seconds,
+    read_versions,
+)
 
 T = TypeVar("T")
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.envs import TASKS
-from torchrl_l1.report.evaluation_data import Evaluation
 from torchrl_l1.report.identity import ALGORITHMS, BASELINE, NOISES, default_text, facts
+from torchrl_l1.report.reading import Evaluation
 from torchrl_l1.report.runs import Run
 
 Deviations = tuple[tuple[str, str], ...]

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_l1.dynamics import EnsembleDynamics, make_dynamics
+from torchrl_l1.dynamics import EnsembleDynamics, make_dynamics, network
 from torchrl_l1.planning import PlanningNetwork, resolve_precision
 
 
@@ -79,9 +79,22 @@ def test_precision_is_chosen_by_what_the_processor_can(monkeypatch):
     assert resolve_precision("auto") == "float32"
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_bf16": True})
     assert resolve_precision("auto") == "bfloat16"
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
+    for faster, chosen in ((True, "bfloat16"), (False, "float32")):
+        monkeypatch.setattr(network, "_multiplies_bfloat16_faster", lambda faster=faster: faster)
+        assert resolve_precision("auto") == chosen
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_bf16": True})
     assert resolve_precision("auto", "meta") == "float32"
     assert resolve_precision("auto", "cpu", 64) == "float32"
     assert resolve_precision("bfloat16", "cpu", 64) == "bfloat16"
     assert resolve_precision("float32") == "float32"
     with pytest.raises(ValueError, match=r"precision must be .* got 'float16'"):
         resolve_precision("float16")
+
+
+def test_the_faster_product_is_found(monkeypatch):
+    network._multiplies_bfloat16_faster.cache_clear()
+    clock = iter(range(10**6))
+    monkeypatch.setattr(network, "perf_counter", lambda: next(clock) * 1.0)
+    assert not network._multiplies_bfloat16_faster()  # both take one tick
+    network._multiplies_bfloat16_faster.cache_clear()

@@ -1,18 +1,21 @@
-"""A frozen copy of an ensemble in the precision that plans fastest."""
+"""A frozen copy of an ensemble in the precision that is fastest, to plan and to imagine with."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import cache
 from itertools import accumulate
-from math import prod
+from math import inf, prod
+from time import perf_counter
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
-from torchrl_l1.dynamics import DeterministicHead, EnsembleDynamics
+from torchrl_l1.dynamics.heads import DeterministicHead
+from torchrl_l1.dynamics.model import EnsembleDynamics
 
 Precision = Literal["auto", "float32", "bfloat16"]
 
@@ -33,14 +36,21 @@ _LEAST_WIDTH = 192
 
 
 def resolve_precision(
-    precision: str, device: torch.device | str = "cpu", width: int = _LEAST_WIDTH
+    precision: str,
+    device: torch.device | str = "cpu",
+    width: int = _LEAST_WIDTH,
+    name: str = "precision",
 ) -> Literal["float32", "bfloat16"]:
-    """``"auto"`` becomes ``"bfloat16"`` for wide layers on processors that multiply it natively.
+    """``"auto"`` becomes ``"bfloat16"`` for wide layers on processors that multiply it faster.
+
+    Those with AMX do, by far. Of those with AVX-512 alone, some multiply it at twice the rate of
+    float32 and some at half of it, so that two small products are timed once per process.
 
     Args:
         precision: ``"auto"``, or what is to be returned.
         device: where the products are computed.
         width: of the narrowest hidden layer.
+        name: of the setting, for the error.
 
     Raises:
         ValueError: for an unknown precision.
@@ -50,19 +60,32 @@ def resolve_precision(
     if precision == "bfloat16":
         return "bfloat16"
     if precision != "auto":
-        raise ValueError(f"precision must be 'auto', 'float32' or 'bfloat16', got {precision!r}")
+        raise ValueError(f"{name} must be 'auto', 'float32' or 'bfloat16', got {precision!r}")
     if torch.device(device).type != "cpu" or width < _LEAST_WIDTH:
         return "float32"
     # Only recent versions of torch tell.
     tell: Callable[[], dict[str, Any]] = getattr(torch.cpu, "get_capabilities", dict)
     capabilities = tell()
-    native = capabilities.get("amx_bf16") or capabilities.get("avx512_bf16")
-    return "bfloat16" if native else "float32"
+    faster = capabilities.get("amx_bf16") or (
+        capabilities.get("avx512_bf16") and _multiplies_bfloat16_faster()
+    )
+    return "bfloat16" if faster else "float32"
 
 
-def planning_precision(
-    dynamics: EnsembleDynamics, precision: str
-) -> Literal["float32", "bfloat16"]:
+@cache
+def _multiplies_bfloat16_faster() -> bool:
+    """Whether a product of hidden units takes clearly less time in bfloat16 than in float32."""
+    seconds = {torch.float32: inf, torch.bfloat16: inf}
+    for _ in range(10):
+        for dtype, least in seconds.items():
+            factor = torch.ones(256, 256, dtype=dtype)
+            start = perf_counter()
+            torch.mm(factor, factor)
+            seconds[dtype] = min(least, perf_counter() - start)
+    return seconds[torch.bfloat16] < 0.8 * seconds[torch.float32]
+
+
+def model_precision(dynamics: EnsembleDynamics, precision: str) -> Literal["float32", "bfloat16"]:
     """What ``precision`` becomes for a model, see :func:`resolve_precision`."""
     widths = [weight.shape[2] for weight in dynamics.network.weights[:-1]]
     return resolve_precision(precision, dynamics.device, min(widths, default=0))
@@ -70,7 +93,7 @@ def planning_precision(
 
 @dataclass(frozen=True)
 class PlanningNetwork:
-    """Weights of an ensemble's elites, copied once per plan.
+    """Weights of an ensemble's elites, copied once per plan or imagination.
 
     The products of hidden units, nearly all of the work, run in the precision asked for; input
     layer, statistics and states stay float32. The statistics of the inputs are folded into the
@@ -118,7 +141,7 @@ class PlanningNetwork:
             ValueError: for an unknown precision.
         """
         device = dynamics.change_normalizer.mean.device
-        hidden = getattr(torch, planning_precision(dynamics, precision))
+        hidden = getattr(torch, model_precision(dynamics, precision))
         elites = dynamics.elites.to(device)
         weights = [weight[elites].double() for weight in dynamics.network.weights]
         biases = [bias[elites, 0].double() for bias in dynamics.network.biases]
@@ -223,7 +246,10 @@ class ForwardPass:
                 if operand is not units:
                     operand.copy_(units)
                 torch.mm(operand, weight, out=out)
-        return affine_output(self._out.float(), inputs[:, self._width :].repeat(self._copies, 1))
+        raw = self._out.float()
+        if self._width == inputs.shape[1]:
+            return raw
+        return affine_output(raw, inputs[:, self._width :].repeat(self._copies, 1))
 
 
 def affine_output(raw: Tensor, action: Tensor) -> Tensor:
