@@ -7,9 +7,8 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
-from torchrl_l1.algorithms.policy import GaussianActor, GaussianPolicy, acting, make_actor
+from torchrl_l1.algorithms.policy import GaussianActor, GaussianPolicy, acting, kinds_of, make_actor
 from torchrl_l1.envs import get_task
-from torchrl_l1.experiment.stages import kinds_of
 
 
 def test_distribution_is_the_gaussian_that_sample_draws_from() -> None:
