@@ -28,4 +28,4 @@ def test_collection_is_measured_with_both_actors(monkeypatch: pytest.MonkeyPatch
     table = collection.table(1)
     (row,) = table.rows
     assert set(table.columns) <= set(row)
-    assert all(isinstance(row[name], float) and row[name] > 0 for name in ("off", "actor_ratio"))
+    assert min(float(row[name]) for name in ("off", "eager", "torchrl", "actor_ratio")) > 0
