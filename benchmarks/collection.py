@@ -68,7 +68,7 @@ def _collecting(collection: Collection) -> Callable[[], object]:
     return lambda: collection.collect(0, next(iterations))
 
 
-def run(repetitions: int, threads: tuple[int, ...] = THREAD_COUNTS) -> list[Row]:
+def run(repetitions: int, threads: tuple[int, ...]) -> list[Row]:
     """Measure all settings.
 
     Args:
@@ -133,7 +133,7 @@ def table(repetitions: int) -> Table:
         "of the speed without it, that of the actor is the gain over TorchRL's own actor without "
         "L1. Five members of ReLU units, fitted to random data; an untrained policy. Where there "
         "is no working compiler, `compiled` runs eagerly.",
-        run(repetitions),
+        run(repetitions, THREAD_COUNTS),
         {
             "threads": "threads",
             "task": "task",

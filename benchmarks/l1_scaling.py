@@ -34,7 +34,7 @@ class _Apart:
 
 
 @torch.no_grad()
-def run(repetitions: int, threads: tuple[int, ...] = THREAD_COUNTS) -> list[Row]:
+def run(repetitions: int, threads: tuple[int, ...]) -> list[Row]:
     """Measure all numbers of environments.
 
     Args:
@@ -91,7 +91,7 @@ def table(repetitions: int) -> Table:
         "2 x 256 ReLU units, 17 observations and 6 actions: with the switching law and the "
         "tangents as passes of their own, in one pass over the whole batch, and in one pass in "
         "blocks of rows, as `L1Transform` has it.",
-        run(repetitions),
+        run(repetitions, THREAD_COUNTS),
         {
             "threads": "threads",
             "num_envs": "environments",

@@ -1,0 +1,31 @@
+"""What L1 costs is measured on computations that agree, with the columns that are shown."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from benchmarks import collection, l1_scaling
+
+
+def test_scaling_has_a_row_per_size_and_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(l1_scaling, "SIZES", (1, 150))
+    monkeypatch.setattr(l1_scaling, "HIDDEN", (8,))
+    monkeypatch.setattr(l1_scaling, "THREAD_COUNTS", (1,))
+    before = torch.get_num_threads()
+    table = l1_scaling.table(1)
+    assert [(row["threads"], row["num_envs"]) for row in table.rows] == [(1, 1), (1, 150)]
+    assert all(set(table.columns) <= set(row) for row in table.rows)
+    assert torch.get_num_threads() == before
+
+
+def test_collection_is_measured_with_both_actors(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collection, "SETTINGS", (("inverted_pendulum", 2, 1.0),))
+    monkeypatch.setattr(collection, "WIDTHS", (8,))
+    monkeypatch.setattr(collection, "COMPILE", {"eager": False, "compiled": False})
+    monkeypatch.setattr(collection, "STEPS", 10)
+    monkeypatch.setattr(collection, "THREAD_COUNTS", (1,))
+    table = collection.table(1)
+    (row,) = table.rows
+    assert set(table.columns) <= set(row)
+    assert min(float(row[name]) for name in ("off", "eager", "torchrl", "actor_ratio")) > 0
