@@ -140,3 +140,39 @@ def test_unknown_device_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ValueError, match="no CUDA device"):
         METRPO("inverted_pendulum", tiny(), device="cuda")
+
+
+def test_fits_and_imagination_have_a_precision_each() -> None:
+    wide = {"model": ModelConfig(members=2, hidden=[16, 16])}
+    plain = make(l1=None, **wide)
+    assert plain.choices() == {"device": "cpu", "fit": "float32", "imagination": "float32"}
+    fit = FitConfig(batch_size=32, max_epochs=3, precision="bfloat16")
+    rounded = make(l1=None, fit=fit, precision="bfloat16", **wide)
+    assert rounded.choices() == {"device": "cpu", "fit": "bfloat16", "imagination": "bfloat16"}
+    # Layers this narrow are not worth it.
+    narrow = make(fit=FitConfig(precision="auto"), precision="auto")
+    assert narrow.choices()["fit"] == narrow.choices()["imagination"] == "float32"
+    losses = []
+    for algorithm in (plain, rounded):
+        results = [result.metrics for result in algorithm.iterate()]
+        assert all(math.isfinite(value) for metrics in results for value in metrics.values())
+        assert all(weight.dtype == torch.float32 for weight in algorithm.dynamics.parameters())
+        losses.append(results[0]["model/validation_loss"])
+    assert losses[0] != losses[1] == pytest.approx(losses[0], rel=0.05)
+
+
+def test_unknown_precisions_are_named() -> None:
+    with pytest.raises(ValueError, match=r"^precision must be .* got 'half'"):
+        tiny(precision="half")
+    with pytest.raises(ValueError, match=r"^fit.precision must be .* got 'half'"):
+        FitConfig(precision="half")
+
+
+def test_a_policy_of_ones_own_is_improved_by_autograd() -> None:
+    algorithm = make(l1=None)
+    # The same function, but not of a kind whose derivatives are written down.
+    algorithm.policy.mean = torch.nn.Sequential(algorithm.policy.mean, torch.nn.Identity())
+    metrics = next(algorithm.iterate()).metrics
+    reference = next(make(l1=None).iterate()).metrics
+    assert metrics["trpo/kl"] == pytest.approx(reference["trpo/kl"], rel=0.05)
+    assert metrics["trpo/accepted"] == reference["trpo/accepted"]

@@ -21,6 +21,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl_l1.algorithms.facts import KINDS
 from torchrl_l1.dynamics import Normalizer
 from torchrl_l1.envs import Task
+from torchrl_l1.objectives import is_tanh_network
 
 _MEAN = (ExplorationType.DETERMINISTIC, ExplorationType.MEAN, ExplorationType.MODE)
 
@@ -69,12 +70,20 @@ class GaussianPolicy(nn.Module):
         loc, scale = self(observation)
         return torch.addcmul(loc, scale, torch.randn_like(loc))
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is what this class makes, of which faster code may know the inside."""
+        return type(self) is GaussianPolicy and is_tanh_network(self.mean)
+
     @torch.no_grad()
     def sampler(self) -> Callable[[Tensor], Tensor]:
         """What :meth:`sample` does with the parameters as they are now, for many calls.
 
-        The statistics are folded into the first layer, and nothing is prepared twice.
+        The statistics are folded into the first layer, and nothing is prepared twice. A policy of
+        one's own samples as it does.
         """
+        if not self.is_plain:
+            return torch.no_grad()(self.sample)
         layers = [layer for layer in self.mean if isinstance(layer, nn.Linear)]
         weights = [layer.weight.t().clone() for layer in layers]
         biases = [layer.bias.clone() for layer in layers]

@@ -20,7 +20,6 @@ from torchrl_l1.objectives import (
     LinearFeatureBaseline,
     TRPOReport,
     gaussian_trpo_step,
-    is_tanh_network,
     trpo_step,
 )
 
@@ -106,7 +105,7 @@ class PolicyImprovement:
 
     def _improve(self, observation: Tensor, action: Tensor, advantage: Tensor) -> TRPOReport:
         policy, config = self.policy, self.config.trpo
-        if type(policy) is GaussianPolicy and is_tanh_network(policy.mean):
+        if policy.is_plain:
             inputs = policy.normalizer.normalize(observation)
             return gaussian_trpo_step(
                 policy.mean, policy.log_std, inputs, action, advantage, config

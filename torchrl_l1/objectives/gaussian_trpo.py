@@ -108,10 +108,7 @@ class _GaussianProblem:
         weight = (self.advantage / self.advantage.shape[0])[:, None]
         weighted = self.error * weight
         by_log_std = (self.error * weighted).sum(0) - weight.sum()
-        slopes = [1 - units.square() for units in self.units[1:]]
-        return torch.cat(
-            [by_log_std, *_pull(weighted / self.std, self.old_weights, self.units, slopes)]
-        )
+        return torch.cat([by_log_std, *_pull(weighted / self.std, self.old_weights, self.units)])
 
     def fisher_product(self, vector: Tensor) -> Tensor:
         sizes = [shape.numel() for shape in self.shapes]
@@ -119,7 +116,7 @@ class _GaussianProblem:
             part.view(shape) for part, shape in zip(vector.split(sizes), self.shapes, strict=True)
         ]
         tangent = _push(parts[1::2], parts[2::2], self.old_weights, self.states, self.slopes)
-        pulled = _pull(tangent * self.precision, self.old_weights, self.states, self.slopes)
+        pulled = _pull(tangent * self.precision, self.old_weights, self.states)
         return torch.cat([2 * parts[0], *pulled])
 
     def evaluate(self) -> tuple[Tensor, Tensor]:
@@ -157,13 +154,12 @@ def _push(
     return tangent
 
 
-def _pull(
-    by_output: Tensor, at: Sequence[Tensor], units: Sequence[Tensor], slopes: Sequence[Tensor]
-) -> list[Tensor]:
+def _pull(by_output: Tensor, at: Sequence[Tensor], units: Sequence[Tensor]) -> list[Tensor]:
     """Gradients of weights and biases from those of the outputs, flat, in the network's order."""
     gradients: list[Tensor] = []
     for layer in range(len(at) - 1, -1, -1):
         gradients += [by_output.sum(0), (by_output.t() @ units[layer]).flatten()]
         if layer:
-            by_output = (by_output @ at[layer]).mul_(slopes[layer - 1])
+            # Times the tanh's slope, in one pass.
+            by_output = torch.ops.aten.tanh_backward(by_output @ at[layer], units[layer])
     return gradients[::-1]
