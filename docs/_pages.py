@@ -71,7 +71,7 @@ def _documented(package: str) -> dict[str, tuple[ModuleType, str]]:
     found = {}
     for name in getattr(home, "__all__", ()):
         module, original = _origin(home, name)
-        if _inside(home, module):  # else it is another package's, and documented there
+        if _inside(home, module) or not _exported(module, original):  # else documented there
             found[f"{home.__name__}.{name}"] = (module, original)
     for name in UNEXPORTED.get(package, ()):
         module = _defining(home, name)
@@ -81,6 +81,12 @@ def _documented(package: str) -> dict[str, tuple[ModuleType, str]]:
 
 def _inside(home: ModuleType, module: ModuleType) -> bool:
     return f"{module.__name__}.".startswith(f"{home.__name__}.")
+
+
+def _exported(module: ModuleType, name: str) -> bool:
+    """Whether the package that a module is in exports a name of it."""
+    package = importlib.import_module(module.__name__.rpartition(".")[0])
+    return any(_origin(package, one) == (module, name) for one in getattr(package, "__all__", ()))
 
 
 def _origin(module: ModuleType, name: str) -> tuple[ModuleType, str]:
