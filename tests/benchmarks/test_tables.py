@@ -58,7 +58,7 @@ def test_collection_benchmark_switches_with_a_fitted_model(monkeypatch: pytest.M
     monkeypatch.setattr(collection, "COMPILE", {"eager": False})
     monkeypatch.setattr(collection, "STEPS", 10)
     monkeypatch.setattr(collection, "FIT", FitConfig(batch_size=50, max_gradient_steps=20))
-    (row,) = collection.run(1)
+    (row,) = collection.run(1, (1,))
     assert row["model"] == "2 x 8"
     assert row["switches"] > 100
     assert row["eager_ratio"] > 0

@@ -132,6 +132,7 @@ class Collection:
             reset_at_each_iter=True,
             # Otherwise every entry is checked for its device, twice a step.
             device=env.device,
+            trust_policy=True,
             track_traj_ids=False,
             exploration_type=ExplorationType.RANDOM,
             auto_register_policy_transforms=False,
