@@ -30,9 +30,10 @@ def test_evaluate_sweeps_epsilon_and_alpha(
         (1e-9, 0.05),
         (1e9, 0.05),
     ]
-    # A tolerance of nearly nothing moves the operating point again and again, a huge one never.
+    # A tolerance of nearly nothing moves the operating point whenever a unit of the network has
+    # changed sides since (it is linear else), a huge one never.
     often, never = (float(row["l1/switch_rate"]) for row in rows[1:])
-    assert often > 0.9 and never == 0
+    assert often > 0.3 and never == 0
     labels = ["off", "paper epsilon=1e-09 alpha=0.05", "paper epsilon=1e+09 alpha=0.05"]
     with (directory / "evaluation" / "summary.csv").open() as file:
         assert [row["l1"] for row in csv.DictReader(file)] == labels
