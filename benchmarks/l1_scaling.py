@@ -10,7 +10,7 @@ import torch
 from benchmarks.tables import Table
 from benchmarks.timing import Row, interleave, ratio, spread
 from torchrl_l1.control import ActionJacobian, L1Config, augment, init
-from torchrl_l1.control.layout import Step, make_step
+from torchrl_l1.control.affine import Step, make_step
 from torchrl_l1.dynamics import EnsembleDynamics
 
 SIZES = (1, 6, 25, 64, 256, 1024, 4096)

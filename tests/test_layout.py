@@ -95,6 +95,35 @@ def test_modules_make_no_circle() -> None:
         raise AssertionError(" <- ".join(error.args[1])) from None
 
 
+def exported(package: str) -> set[str]:
+    """What a package's ``__all__`` holds; nothing where there is none."""
+    for node in ast.parse(MODULES[package].read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+            return set(ast.literal_eval(node.value))
+    return set()
+
+
+def test_every_name_has_one_import_path() -> None:
+    public = {package: exported(f"torchrl_l1.{package}") for package in ORDER}
+    wrong = []
+    for name, file in MODULES.items():
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if not (isinstance(node, ast.ImportFrom) and node.module) or name == "torchrl_l1":
+                continue
+            home = layer(node.module)
+            names = {alias.name for alias in node.names}
+            if home is None and node.module == "torchrl_l1":
+                # Looked up when first asked for, which would hide a circle.
+                wrong += [f"{name}: {node.module}.{one}" for one in names - {"__version__"}]
+            elif home == layer(name) and not file.name.startswith("__init__"):
+                wrong += [f"{name}: its own package"] * (
+                    node.module == f"torchrl_l1.{home}" and bool(names & public[home])
+                )
+            elif home and home != layer(name) and node.module != f"torchrl_l1.{home}":
+                wrong += [f"{name}: {node.module}.{one}" for one in names & public[home]]
+    assert not wrong
+
+
 def test_only_packages_say_what_is_public() -> None:
     for name, file in MODULES.items():
         if file.name != "__init__.py":

@@ -12,7 +12,7 @@ from torch._dynamo.exc import FailOnRecompileLimitHit, TorchDynamoException
 
 from torchrl_l1.compilation import compiled
 from torchrl_l1.control import ActionJacobian, L1Config, augment, init, law
-from torchrl_l1.control.layout import BLOCK, make_step
+from torchrl_l1.control.affine import BLOCK, make_step
 from torchrl_l1.dynamics import EnsembleDynamics
 
 HEADERS = Path(sysconfig.get_path("include")) / "Python.h"

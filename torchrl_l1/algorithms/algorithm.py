@@ -81,8 +81,9 @@ class Surroundings(TypedDict, total=False):
 class Algorithm(ABC):
     """What model-based algorithms share: task, model, data, random streams, phases, state.
 
-    A loop goes over :meth:`rounds`, does its work in :meth:`phase` after phase, and yields the
-    :meth:`result` of each round.
+    A loop goes over :meth:`rounds`, does its work in :meth:`phase` after phase, and yields what
+    :meth:`complete` makes of each round. A subclass sets ``learning``, for it knows how many real
+    steps there will be, and says what acts (:attr:`policies`).
 
     Args:
         task: name of a task, see :data:`torchrl_l1.envs.TASKS`.
@@ -104,7 +105,7 @@ class Algorithm(ABC):
         iteration: outer iterations that are complete.
         dynamics: the model.
         acting_dynamics: the model that L1 uses in real environments, on the CPU.
-        learning: the model's data and fits; a subclass says how many there will be.
+        learning: the model's data and fits.
         real: makes real environments, see :class:`~torchrl_l1.algorithms.collection.Collection`.
         horizon: steps per full real episode.
         episode_steps: steps of a collected one.
@@ -170,7 +171,9 @@ class Algorithm(ABC):
         while self.iteration < self.config.outer_iterations:
             seed_streams(self.seed, "iteration", self.iteration)
             self._seconds = dict.fromkeys(self.facts.phases, 0.0)
-            yield self.iteration
+            yield (iteration := self.iteration)
+            if self.iteration == iteration:
+                raise RuntimeError("an outer iteration was not completed: call complete()")
 
     @contextmanager
     def phase(self, name: str, words: str = "") -> Iterator[None]:
@@ -192,7 +195,7 @@ class Algorithm(ABC):
             self.acting_dynamics.load_state_dict(self.dynamics.state_dict())
         return fit_metrics(report)
 
-    def result(self, real_steps: int, metrics: Mapping[str, float]) -> IterationResult:
+    def complete(self, real_steps: int, metrics: Mapping[str, float]) -> IterationResult:
         """End the outer iteration after so many real steps in all."""
         head = {"iteration": self.iteration, "real_steps": real_steps}
         self.iteration += 1

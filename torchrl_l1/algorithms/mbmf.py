@@ -152,7 +152,7 @@ class MBMF(Algorithm):
             metrics = stages[name](number)
             collected = self.config.collected_episodes(iteration + 1) * self.episode_steps
             stage = {"stage": self.facts.position(name) + 1}
-            yield self.result(self.start.frames + collected, {**stage, **metrics})
+            yield self.complete(self.start.frames + collected, {**stage, **metrics})
 
     def _shoot(self, number: int) -> dict[str, float]:
         """Stage 1: fit the model, let the planner act, with L1 around it if it is on."""

@@ -139,7 +139,7 @@ class METRPO(Algorithm):
                 **policy_metrics(steps),
                 "policy/std": self.policy.log_std.detach().exp().mean().item(),
             }
-            yield self.result((iteration + 2) * self.collection.frames, metrics)
+            yield self.complete((iteration + 2) * self.collection.frames, metrics)
 
     @property
     def policies(self) -> Mapping[str, TensorDictModuleBase]:

@@ -117,7 +117,9 @@ class PETS(Algorithm):
                 **self.fit_report,
                 "plan/promised_return": data["next", "plan", "best_return"].mean().item(),
             }
-            yield self.result(self.start.frames + (iteration + 1) * self.collection.frames, metrics)
+            yield self.complete(
+                self.start.frames + (iteration + 1) * self.collection.frames, metrics
+            )
 
     def measured(self, data: TensorDictBase) -> TensorDictBase:
         """The collected episodes if they are full, else others beside the data."""

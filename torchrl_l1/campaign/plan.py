@@ -13,6 +13,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_l1.algorithms.algorithm import resolve_device
+from torchrl_l1.algorithms.config import episode_length
 from torchrl_l1.campaign.description import (
     Campaign,
     CampaignError,
@@ -62,8 +63,8 @@ class PlannedRun:
     def collected_steps(self, iterations: int) -> int:
         """Real steps that so many outer iterations collect; random data do not count."""
         full = self.config.horizon or get_task(self.config.task).horizon
-        steps = min(self.config.episode_steps or full, full)
-        return self._recipe.collected_episodes(iterations) * int(steps)
+        steps = episode_length(self.config.episode_steps, full)
+        return self._recipe.collected_episodes(iterations) * steps
 
     def stages(self) -> tuple[str, ...]:
         """The stages that the run has reached once it is finished."""

@@ -3,15 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from types import FunctionType
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
 
+from torchrl_l1.compilation import CompileMode, compiled
 from torchrl_l1.control import law
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import ActionJacobian
 from torchrl_l1.control.law import L1Diagnostics, L1State
+
+BLOCK = 128
+"""Rows of a batch that the ensemble evaluates at once on a processor.
+
+With more, the tangents of wide layers do not stay in its cache: 256 rows of five members of 256
+units and six actions are 8 MB. With fewer, a small model would only wait for the next call.
+"""
+
+Step = tuple[Tensor, L1State, L1Diagnostics | None]
+StepFunction = Callable[[L1State, Tensor, Tensor], Step]
+"""A step of L1: executed input, next state and, if they are computed, diagnostics."""
 
 
 class AffineModel(NamedTuple):
@@ -207,3 +221,41 @@ def _tested_input(
     # It does not depend on the operating point: the filter's next state is known.
     adapted = law.saturate(config, u_rl - law.filtered(config, state.q, state.sigma_m))
     return torch.where(state.started, adapted, u_rl)
+
+
+def make_step(
+    config: L1Config, model: ActionJacobian, mode: CompileMode, diagnostics: bool = True
+) -> StepFunction:
+    """The step of L1 as a function of state, observation and action, compiled or not.
+
+    Without ``diagnostics`` it returns ``None`` in their place, and does not compute them. Large
+    batches pass in blocks of :data:`BLOCK` rows where the model allows it.
+    """
+
+    def step(state: L1State, observation: Tensor, u_rl: Tensor) -> Step:
+        if diagnostics:
+            return augment(config, model, state, observation, u_rl)
+        return *augment_silently(config, model, state, observation, u_rl)[:2], None
+
+    # Environments keep their batch size, so graphs with free sizes would only cost: and torch
+    # cannot make dual tensors of them, which forward-mode Jacobians need.
+    whole = compiled(cast(FunctionType, step), mode, dynamic=False)
+    return partial(_in_blocks, whole) if model.blockwise else whole
+
+
+def _in_blocks(step: StepFunction, state: L1State, observation: Tensor, u_rl: Tensor) -> Step:
+    batch = observation.shape[:-1]
+    if batch.numel() <= BLOCK or observation.device.type != "cpu":
+        return step(state, observation, u_rl)
+    rows = (x.reshape(-1, x.shape[-1]).split(BLOCK) for x in (*state, observation, u_rl))
+    steps = [step(L1State(*x[:-2]), *x[-2:]) for x in zip(*rows, strict=True)]
+
+    def joined(parts: tuple[Tensor, ...]) -> Tensor:
+        return torch.cat(parts).reshape(*batch, -1)
+
+    executed, states, signals = zip(*steps, strict=True)
+    return (
+        joined(executed),
+        L1State(*map(joined, zip(*states, strict=True))),
+        None if signals[0] is None else L1Diagnostics(*map(joined, zip(*signals, strict=True))),
+    )

@@ -12,6 +12,7 @@ from torchrl.data import Composite
 from torchrl.envs.transforms import TensorDictPrimer
 
 from torchrl_l1.compilation import CompileMode
+from torchrl_l1.control.affine import make_step
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import Predicts
 from torchrl_l1.control.law import L1State
@@ -22,7 +23,6 @@ from torchrl_l1.control.layout import (
     advance,
     as_action_jacobian,
     declared_dimension,
-    make_step,
 )
 
 

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
-from types import FunctionType
-from typing import TypeAlias, cast
+from typing import TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,9 +13,8 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_l1.compilation import CompileMode, compiled
 from torchrl_l1.control import law
-from torchrl_l1.control.affine import augment, augment_silently
+from torchrl_l1.control.affine import StepFunction
 from torchrl_l1.control.config import L1Config, Scalars
 from torchrl_l1.control.jacobian import ActionJacobian, ChangeFunction, DynamicsModel, Predicts
 from torchrl_l1.control.law import L1Diagnostics, L1State
@@ -170,8 +166,6 @@ def _scalars(bound: Tensor) -> Scalars:
 
 
 Dynamics: TypeAlias = ActionJacobian | DynamicsModel | TensorDictModuleBase | ChangeFunction
-Step = tuple[Tensor, L1State, L1Diagnostics | None]
-StepFunction = Callable[[L1State, Tensor, Tensor], Step]
 
 
 def as_action_jacobian(
@@ -190,52 +184,6 @@ def as_action_jacobian(
         return dynamics
     return ActionJacobian(
         dynamics, observation_key=observation_key, action_key=action_key, predicts=predicts
-    )
-
-
-BLOCK = 128
-"""Rows of a batch that the ensemble evaluates at once on a processor.
-
-With more, the tangents of wide layers do not stay in its cache: 256 rows of five members of 256
-units and six actions are 8 MB. With fewer, a small model would only wait for the next call.
-"""
-
-
-def make_step(
-    config: L1Config, model: ActionJacobian, mode: CompileMode, diagnostics: bool = True
-) -> StepFunction:
-    """The step of L1 as a function of state, observation and action, compiled or not.
-
-    Without ``diagnostics`` it returns ``None`` in their place, and does not compute them. Large
-    batches pass in blocks of :data:`BLOCK` rows where the model allows it.
-    """
-
-    def step(state: L1State, observation: Tensor, u_rl: Tensor) -> Step:
-        if diagnostics:
-            return augment(config, model, state, observation, u_rl)
-        return *augment_silently(config, model, state, observation, u_rl)[:2], None
-
-    # Environments keep their batch size, so graphs with free sizes would only cost: and torch
-    # cannot make dual tensors of them, which forward-mode Jacobians need.
-    whole = compiled(cast(FunctionType, step), mode, dynamic=False)
-    return partial(_in_blocks, whole) if model.blockwise else whole
-
-
-def _in_blocks(step: StepFunction, state: L1State, observation: Tensor, u_rl: Tensor) -> Step:
-    batch = observation.shape[:-1]
-    if batch.numel() <= BLOCK or observation.device.type != "cpu":
-        return step(state, observation, u_rl)
-    rows = (x.reshape(-1, x.shape[-1]).split(BLOCK) for x in (*state, observation, u_rl))
-    steps = [step(L1State(*x[:-2]), *x[-2:]) for x in zip(*rows, strict=True)]
-
-    def joined(parts: tuple[Tensor, ...]) -> Tensor:
-        return torch.cat(parts).reshape(*batch, -1)
-
-    executed, states, signals = zip(*steps, strict=True)
-    return (
-        joined(executed),
-        L1State(*map(joined, zip(*states, strict=True))),
-        None if signals[0] is None else L1Diagnostics(*map(joined, zip(*signals, strict=True))),
     )
 
 

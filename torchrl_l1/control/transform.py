@@ -15,17 +15,10 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform
 
 from torchrl_l1.compilation import CompileMode
+from torchrl_l1.control.affine import StepFunction, make_step
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import Predicts
-from torchrl_l1.control.layout import (
-    L1_KEY,
-    Dynamics,
-    Layout,
-    StepFunction,
-    advance,
-    as_action_jacobian,
-    make_step,
-)
+from torchrl_l1.control.layout import L1_KEY, Dynamics, Layout, advance, as_action_jacobian
 
 # Where a step's outcome waits, inside the tensordict, for the base environment to return.
 _PENDING = "_l1_pending"

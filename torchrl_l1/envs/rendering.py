@@ -14,7 +14,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
-from torchrl_l1.envs import Task, get_task
+from torchrl_l1.envs.task import Task
+from torchrl_l1.envs.tasks import get_task
 
 _WORKER = Path(__file__).with_name("_render_worker.py")
 _TIMEOUT_SECONDS = 300

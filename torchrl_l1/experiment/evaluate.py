@@ -9,7 +9,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from torchrl_l1.algorithms.algorithm import Algorithm
+from torchrl_l1.algorithms import Algorithm
 from torchrl_l1.algorithms.collection import (
     Collection,
     first_episodes,

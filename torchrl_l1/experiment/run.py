@@ -15,7 +15,7 @@ import wandb
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from torchrl_l1.algorithms.algorithm import Algorithm
+from torchrl_l1.algorithms import Algorithm
 from torchrl_l1.experiment.run_directory import RunDirectory, save_atomically, versions, write_table
 from torchrl_l1.experiment.settings import RunSettings
 

@@ -15,12 +15,13 @@ from torchrl_l1.algorithms import (
     MBMF,
     METRPO,
     PETS,
+    Algorithm,
     MBMFConfig,
     METRPOConfig,
     Perturbation,
     PETSConfig,
 )
-from torchrl_l1.algorithms.algorithm import DEVICES, Algorithm
+from torchrl_l1.algorithms.algorithm import DEVICES
 from torchrl_l1.algorithms.metrpo_config import check_clipping
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config

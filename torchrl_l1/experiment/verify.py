@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_l1.control import law
-from torchrl_l1.control.config import L1Config
+from torchrl_l1.control import L1Config, law
 
 _INPUTS = ("obs", "drift", "jac", "action", "switch", "dt", "bound")
 _OUTPUTS = ("u", "sigma_m", "x_hat")

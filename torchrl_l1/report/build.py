@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchrl_l1.campaign.description import load_yaml, read_campaign
+from torchrl_l1.campaign import read_campaign
+from torchrl_l1.campaign.description import load_yaml
 from torchrl_l1.experiment.recipes import available_campaigns
 from torchrl_l1.experiment.run_directory import write_atomically
 from torchrl_l1.report.comparison import algorithm_sections
