@@ -7,9 +7,9 @@ import json
 import os
 import random
 import signal
-import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -73,19 +73,20 @@ def ended_badly(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str
     return printed
 
 
-def test_killed_campaign_loses_at_most_the_running_iterations(campaign_file: Path) -> None:
+def test_killed_campaign_loses_at_most_the_running_iterations(
+    campaign_file: Path, start_cli: Callable[..., Any]
+) -> None:
     output = campaign_file.parent / "out"
     slower = ["outer_iterations=4", "fit.max_epochs=40", "fit.patience=40"]
     runs = planned(campaign_file, output, *slower)
-    arguments = [sys.executable, "-m", "torchrl_l1.cli", *command(campaign_file, output, *slower)]
+    arguments = command(campaign_file, output, *slower)
     log = campaign_file.with_suffix(".log")
-    with log.open("w") as handle:
-        process = subprocess.Popen(arguments, stdout=handle, stderr=handle)
-        while process.poll() is None and not any(map(timings, runs)):
-            time.sleep(0.005)
-        time.sleep(random.uniform(0, max(map(mean_seconds, runs))))
-        process.send_signal(signal.SIGKILL)
-        assert process.wait() == -signal.SIGKILL, log.read_text()
+    process = start_cli(arguments, log, anew=True)
+    while process.poll() is None and not any(map(timings, runs)):
+        time.sleep(0.005)
+    time.sleep(random.uniform(0, max(map(mean_seconds, runs))))
+    process.kill()
+    assert process.wait() == -signal.SIGKILL, log.read_text()
     if sys.platform.startswith("linux"):
         # Its processes end with it, without any help.
         while any(run.directory.held() for run in runs):
@@ -94,7 +95,7 @@ def test_killed_campaign_loses_at_most_the_running_iterations(campaign_file: Pat
     assert any(before.values())
     assert not all(run.finished() for run in runs)
 
-    assert subprocess.run(arguments, stdout=subprocess.DEVNULL).returncode == 0
+    assert start_cli(arguments, log).wait() == 0, log.read_text()
     for seed, this in enumerate(sorted(runs, key=str)):
         # An iteration that is done again takes another time: these were not.
         kept = before[this.directory.path]
@@ -116,7 +117,7 @@ def timings(this: PlannedRun) -> list[str]:
 
 
 def test_skips_finishes_evaluates_and_goes_on_past_a_failure(
-    campaign_file: Path, capsys: pytest.CaptureFixture[str]
+    campaign_file: Path, start_cli: Callable[..., Any]
 ) -> None:
     output = campaign_file.parent / "it's a = study"
     evaluation = {"name": "noisy", "l1": ["off"], "noise": ["action"], "episodes": 2}
@@ -128,7 +129,10 @@ def test_skips_finishes_evaluates_and_goes_on_past_a_failure(
     blocked.directory.path.mkdir()
     (blocked.directory.path / "thesis.tex").write_text("years of work")
 
-    error = ended_badly(command(campaign_file, output), capsys)
+    log = campaign_file.with_suffix(".log")
+    assert start_cli(command(campaign_file, output), log).wait() == 1
+    error = log.read_text()
+    assert "Traceback" not in error
     assert "seed=1 ended with status 1" in error
     assert "is not empty and holds no run" in error  # from the end of its log
     assert [p.name for p in blocked.directory.path.iterdir()] == ["thesis.tex"]

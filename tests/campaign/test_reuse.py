@@ -73,6 +73,7 @@ def test_shared_runs_are_copied_and_the_others_trained(
     first: PlannedRun,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
+    start_cli: Callable[..., Any],
 ) -> None:
     file, output = write("second", [0, 1]), tmp_path / "second"
     before = contents(first.directory.path)
@@ -86,8 +87,8 @@ def test_shared_runs_are_copied_and_the_others_trained(
     ]
     assert not output.exists()
 
-    main(arguments)
-    lines = capsys.readouterr().out.splitlines()
+    assert start_cli(arguments).wait() == 0
+    lines = (tmp_path / "output").read_text().splitlines()
     assert f"reused metrpo/inverted_pendulum l1=off seed=0 from {first.directory.path}" in lines
     assert [line for line in lines if line.startswith("reused")] == lines[:1]
     copied, trained = planned(file, output)

@@ -6,6 +6,7 @@ import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -109,7 +110,7 @@ def test_bias_acts_after_the_planner(make: Make) -> None:
     assert again["return_mean"] == first["return_mean"], "the same random numbers every time"
 
 
-def test_campaign_over_two_algorithms(make: Make, tmp_path: Path) -> None:
+def test_campaign_over_two_algorithms(tmp_path: Path, start_cli: Callable[..., Any]) -> None:
     file = tmp_path / "both.yaml"
     matrix = {"l1": ["off", "paper"], "seed": [0]}
     recipes = ("pets/inverted_pendulum", "dets/inverted_pendulum")
@@ -117,7 +118,8 @@ def test_campaign_over_two_algorithms(make: Make, tmp_path: Path) -> None:
     file.write_text(dump_yaml({"runs": runs}))
     planned = plan(read_campaign(str(file)), tmp_path / "out")
     assert {one.config.model.head for one in planned} == {"gaussian", "deterministic"}
-    main(["campaign", str(file), "--output", str(tmp_path / "out"), "--workers", "2"])
+    command = ["campaign", str(file), "--output", str(tmp_path / "out"), "--workers", "2"]
+    assert start_cli(command).wait() == 0, (tmp_path / "output").read_text()
     assert all(one.problem() is None for one in planned)
     settings = json.dumps([one.settings() for one in planned])
     assert '"algorithm": "pets"' in settings

@@ -2,16 +2,13 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import random
 import re
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import pytest
 import torch
@@ -276,24 +273,19 @@ def test_interrupted_write_leaves_the_old_file(
 def test_killed_run_resumes_to_the_same_metrics(
     tmp_path: Path,
     tiny_overrides: list[str],
+    start_cli: Callable[..., Any],
     recipe: str,
     overrides: list[str],
     rows_before_kill: tuple[int, ...],
 ) -> None:
     tiny = tiny_overrides if recipe.startswith("metrpo") else []
-    command = [sys.executable, "-m", "torchrl_l1.cli", "run", recipe, *tiny, *overrides]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    command = ["run", recipe, *tiny, *overrides, "--resume"]
 
-    def start(folder: Path) -> subprocess.Popen[bytes]:
-        return subprocess.Popen(
-            [*command, f"run_dir={folder}", "--resume"],
-            env=environment,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+    def start(folder: Path, anew: bool = False) -> Any:
+        return start_cli([*command, f"run_dir={folder}"], anew=anew)
 
     unbroken, killed = tmp_path / "unbroken", tmp_path / "killed"
-    assert start(unbroken).wait(timeout=300) == 0
+    assert start(unbroken, anew=True).wait(timeout=300) == 0
     iteration = mean_seconds(unbroken)
     rng = random.Random(0)
     for count in rows_before_kill:
@@ -301,7 +293,7 @@ def test_killed_run_resumes_to_the_same_metrics(
         while process.poll() is None and not reached(killed, count):
             time.sleep(0.002)
         time.sleep(rng.uniform(0, iteration))
-        process.send_signal(signal.SIGKILL)
+        process.kill()
         assert process.wait() == -signal.SIGKILL
     assert rows(killed) < 6
     assert start(killed).wait(timeout=300) == 0
