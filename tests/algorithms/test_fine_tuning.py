@@ -69,7 +69,7 @@ def test_finds_the_action_of_highest_reward() -> None:
 
 def test_values_approach_the_discounted_return() -> None:
     """Reward one for ever, in pieces of 20 steps: the value is 1 / (1 - gamma)."""
-    policy, fine_tuning = make(discount=0.8, value_learning_rate=1e-2)
+    policy, fine_tuning = make(discount=0.8, value_learning_rate=1e-2, epochs=1, minibatches=4)
     steps, going = 20, torch.zeros(8, 20, 1, dtype=torch.bool)
     for _ in range(12):
         observation = torch.randn(8, steps + 1, TASK.observation_dim)
@@ -95,7 +95,9 @@ def test_values_approach_the_discounted_return() -> None:
 
 def test_nothing_follows_a_termination_in_the_middle_of_the_data() -> None:
     """Reward one per step, every fifth of which ends the task: the value counts what comes."""
-    policy, fine_tuning = make(discount=1.0, gae_lambda=1.0, value_learning_rate=1e-2)
+    policy, fine_tuning = make(
+        discount=1.0, gae_lambda=1.0, value_learning_rate=1e-2, epochs=1, minibatches=4
+    )
     phase = torch.arange(20) % 5
     for _ in range(25):
         observation = torch.zeros(8, 20, TASK.observation_dim)

@@ -51,7 +51,7 @@ def without_newer(settings: DictConfig) -> DictConfig:
 
 def presets(recipe: str) -> list[str]:
     """Those that a recipe finds: of its folder, its algorithm and all."""
-    algorithm = composed(recipe).algorithm
+    algorithm = composed(recipe, "preset=cpu").algorithm  # one of those, composed anyway
     folders = {find_recipe(recipe).parent, recipes_dir() / algorithm, recipes_dir() / "shared"}
     return sorted({file.stem for folder in folders for file in folder.glob("preset/*.yaml")})
 

@@ -138,10 +138,11 @@ def test_one_graph_serves_all_plans(graphs):
 
 
 def test_many_kinds_of_ensembles_compile_in_one_process(graphs):
-    # torch refuses more than eight graphs for one code object.
-    for particles in range(1, 13):
-        returns(make_model("deterministic"), True, particles=particles)
-    assert len(graphs) == 12
+    # torch refuses more graphs than this, eight by default, for one code object.
+    with torch._dynamo.config.patch(recompile_limit=2):
+        for particles in range(1, 5):
+            returns(make_model("deterministic"), True, particles=particles)
+    assert len(graphs) == 4
 
 
 def test_eager_plans_do_not_touch_the_compiler(monkeypatch):
