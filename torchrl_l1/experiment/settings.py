@@ -265,6 +265,7 @@ SCHEMAS: dict[str, type[RunSettings]] = {
 """Schema of the recipes of each algorithm. In a recipe's defaults it is ``<name>_recipe``."""
 
 
+@cache
 def register() -> None:
     """Make the schemas known to Hydra."""
     for name, schema in SCHEMAS.items():
