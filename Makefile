@@ -18,10 +18,10 @@ export PIP_DISABLE_PIP_VERSION_CHECK ?= 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo test lint format docs bench wheel lock clean
+.PHONY: help demo test lint format docs bench bench-smoke wheel lock clean
 
 help: ## Show this list
-	@awk 'BEGIN {FS = ":.*## "} /^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' Makefile
+	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' Makefile
 
 demo: $(VENV)/.installed-base ## Train METRPO on the pendulum, then plot returns against actuator bias
 	$(BIN)/torchrl-l1 run metrpo/inverted_pendulum l1=off outer_iterations=5 seed=$(SEED) \
@@ -46,6 +46,10 @@ docs: $(VENV)/.installed-docs ## Build the documentation, warnings are errors
 
 bench: $(VENV)/.installed-bench ## Run all speed tables (some minutes on an otherwise idle machine)
 	$(BIN)/python -m benchmarks $(BENCH_ARGS)
+
+bench-smoke: $(VENV)/.installed-bench ## Whether the benchmarks run: some of them, once each
+	folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && \
+	    $(BIN)/python -m benchmarks env_stepping imagination trpo --quick --output "$$folder"
 
 wheel: $(VENV)/.installed-base ## Build the wheel into dist/ and check what is in it
 	rm -rf dist
