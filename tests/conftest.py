@@ -105,9 +105,8 @@ def start_cli(tmp_path: Path) -> Callable[..., Process]:
     """
 
     def start(arguments: Sequence[str], output: Path | None = None, anew: bool = False) -> Process:
-        return (Forked if HAS_FORKS and not anew else _started_anew)(
-            arguments, output or tmp_path / "output"
-        )
+        starter = Forked if HAS_FORKS and not anew else _started_anew
+        return starter(arguments, output or tmp_path / "output")
 
     return start
 
