@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from torchrl_l1 import algorithms
+from torchrl_l1.experiment.settings import SCHEMAS
 from torchrl_l1.report.page import markdown
 
 PACKAGES = (
@@ -38,13 +38,13 @@ UNEXPORTED = {
     ),
 }
 
-# What the algorithms log: page, and algorithm.
-METRICS = {"metrics": "METRPO", "metrics_mbmf": "MBMF", "metrics_pets": "PETS"}
+# Pages of what the algorithms log, with the algorithm of each.
+METRICS = {f"metrics_{name}": name for name in SCHEMAS}
 
 
 def metrics_table(algorithm: str) -> str:
     """Every metric that an algorithm logs, as a Markdown table."""
-    metrics = getattr(algorithms, algorithm).facts.metrics
+    metrics = SCHEMAS[algorithm].builds.facts.metrics
     rows = [{"Metric": f"`{name}`", "Meaning": meaning} for name, meaning in metrics.items()]
     return f"{markdown(rows)}\n"
 

@@ -17,6 +17,7 @@ from typing import get_args
 
 import pytest
 import yaml
+from omegaconf import OmegaConf
 
 from torchrl_l1 import planning
 from torchrl_l1.algorithms import MBMF
@@ -29,7 +30,7 @@ from torchrl_l1.envs import TASKS, gymnasium_id
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import available_campaigns, available_recipes, recipes_dir
 from torchrl_l1.experiment.run import MODES
-from torchrl_l1.experiment.settings import SCHEMAS, L1Settings
+from torchrl_l1.experiment.settings import SCHEMAS, L1Settings, flatten
 
 ROOT = Path(__file__).parents[1]
 SNIPPETS = [
@@ -125,15 +126,35 @@ def test_recipes_page_has_every_group_and_option() -> None:
 def test_recipes_page_has_every_key_of_the_controller() -> None:
     page = (ROOT / "docs/recipes.md").read_text()
     named = {word.partition(".")[2] for word in re.findall(r"`(l1\.\w+)`", page)}
-    assert named <= set(L1Settings.__dataclass_fields__)
+    assert named == set(L1Settings.__dataclass_fields__)
 
 
 def test_a_recipe_of_the_page_composes(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
-    file.write_text(block("docs/recipes.md", "yaml", "defaults:"))
+    file.write_text(block("docs/recipes.md", "yaml", "defaults:\n  - /pets/"))
     mine = compose(str(file), ["preset=paper", "run_dir=unused"])
     assert (mine.recipe, mine.task, mine.cem.candidates) == ("mine", "half_cheetah", 300)
     assert mine.cem.horizon == 30 and mine.model.head == "gaussian"
+
+
+def test_a_recipe_from_the_schema_on_has_the_defaults_of_the_shipped_ones(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    text = block("docs/recipes.md", "yaml", "defaults:\n  - /metrpo_recipe")
+    file.write_text(text)
+    name = "metrpo/half_cheetah"
+    own = flatten(yaml.safe_load((recipes_dir() / f"{name}.yaml").read_text()))
+    for overrides in ([], ["preset=paper"], ["l1=reference", "noise=both", "model=affine"]):
+        mine, shipped = (
+            flatten(OmegaConf.to_container(compose(recipe, [*overrides, "run_dir=unused"])))
+            for recipe in (str(file), name)
+        )
+        differ = {key for key in shipped if mine[key] != shipped[key]}
+        assert differ <= set(own) - {"defaults", "task"}
+        assert mine["l1.enabled"] and mine["label"] == "executed"
+    # What the page says of a recipe that names nothing but the schema.
+    file.write_text(re.sub(r"  - /(?!metrpo_recipe).*\n", "", text))
+    bare = compose(str(file), ["run_dir=unused"])
+    assert not bare.l1.enabled and bare.label == "nominal"
 
 
 @pytest.fixture(scope="module")

@@ -43,7 +43,7 @@ class WithToy(Perturbation):
     """What a line in :class:`Perturbation` would make of it."""
 
     actuator_backlash: float = disturbance(
-        "toy", Backlash, neutral=0.0, units="toy units", help="toy widths", matched=True
+        "toy", Backlash, neutral=0.0, units="toy units", help="toy widths"
     )
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from torchrl_l1.algorithms import MBMF, METRPO, PETS, Algorithm, METRPOConfig
-from torchrl_l1.algorithms.pets import DETS
 
+DETS = PETS.facts.of_variant("dets")
 ALGORITHMS: list[type[Algorithm]] = [METRPO, PETS, MBMF]
 
 
@@ -40,10 +40,26 @@ def test_stages_are_named_only_where_there_are_several() -> None:
     assert MBMF.facts.position("dreaming") == -1
 
 
+def test_a_variant_is_the_algorithm_under_another_name() -> None:
+    assert (DETS.name, DETS.phases, DETS.metrics) == ("DETS", PETS.facts.phases, PETS.facts.metrics)
+    assert DETS.color != PETS.facts.color and not DETS.variants
+
+
+def test_stages_with_l1() -> None:
+    assert [one.facts.l1_words for one in ALGORITHMS] == ["", "", "random shooting"]
+    assert [stage.with_l1 for stage in MBMF.facts.stages] == [True, False, False]
+
+
+def test_times_of_random_data_have_no_column() -> None:
+    assert list(MBMF.facts.timed_phases.values()) == [
+        "fit", "cloning", "PPO", "collection", "measuring returns",
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_every_metric_is_explained_and_every_phase_has_words(algorithm: type[Algorithm]) -> None:
-    for mapping in (algorithm.facts.metrics, algorithm.facts.phases):
-        assert all(text.strip() for text in mapping.values())
+    assert all(text.strip() for text in algorithm.facts.metrics.values())
+    assert all(phase.words.strip() for phase in algorithm.facts.phases.values())
     names = {part.name for part in fields(algorithm.config_class)}
     assert {"outer_iterations", "episode_steps", "label", "model", "fit"} <= names
 

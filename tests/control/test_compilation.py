@@ -132,16 +132,30 @@ def test_auto_reports_the_fault_of_the_arguments_not_the_compilers(monkeypatch):
 def test_many_controllers_compile_in_one_process(monkeypatch):
     # torch refuses more graphs than this, eight by default, for one code object.
     limit = torch._dynamo.config.patch(recompile_limit=2)
+    graphs = []
+
+    def backend(graph, inputs):
+        graphs.append(graph)
+        return graph
+
     real = torch.compile
     monkeypatch.setattr(
-        torch, "compile", lambda function, **options: real(function, backend="eager", **options)
+        torch, "compile", lambda function, **options: real(function, backend=backend, **options)
     )
     model = ActionJacobian(lambda x, u: 0.1 * x + u.sin())
     with limit:
         for k in range(4):
-            step = make_step(L1Config(0.01 * (k + 1)), model, True)
+            config = L1Config(0.01 * (k + 1))
             batch = k % 3 + 1
-            step(init([batch], 3, 1), torch.zeros(batch, 3), torch.zeros(batch, 1))
+            found, expected = init([batch], 3, 1), init([batch], 3, 1)
+            step = make_step(config, model, True)
+            for _ in range(3):
+                x, u_rl = torch.randn(batch, 3), torch.randn(batch, 1)
+                u, found, _ = step(found, x, u_rl)
+                u_expected, expected, _ = augment(config, model, expected, x, u_rl)
+                torch.testing.assert_close(u, u_expected)
+                torch.testing.assert_close(found.x_hat, expected.x_hat)
+    assert len(graphs) == 4
 
 
 def test_modes():

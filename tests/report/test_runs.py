@@ -4,10 +4,11 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from torchrl_l1.experiment.errors import RunDirectoryError
-from torchrl_l1.report.runs import find_readable_runs, find_runs
+from torchrl_l1.report.runs import find_readable_runs, find_runs, l1_means
 
 WriteRun = Callable[..., Path]
 
@@ -110,12 +111,13 @@ def test_signals_and_times_are_read_where_they_are(write_run: WriteRun, tmp_path
     path = write_run([1] * 5, "l1=paper", signals=signals, timings=timings, steps=1000)
     bare = write_run([1] * 5, "l1=off")
     runs = {run.path: run for run in find_runs([tmp_path])}
-    assert runs[path].final_signal("l1/switch_rate") == pytest.approx(0.2)
-    assert runs[path].final_signal("l1/u_a") == pytest.approx(3.0)
+    # Of the last three; what is not known of one of them is not known.
+    means = l1_means([runs[path]], [runs[path].ending])
+    assert means == pytest.approx({"switches_per_1000": 200.0, "u_a": 3.0})
+    assert l1_means([runs[path]], [np.array([4])], ("u_a",)) == {"u_a": 6.0}
+    assert l1_means([runs[bare]], [runs[bare].ending]) == {}
     # (0 + 1) + ... + (4 + 1) seconds for 6000 steps, the random ones among them.
     assert runs[path].milliseconds_per_step == pytest.approx(15 / 6000 * 1000)
-    assert math.isnan(runs[path].final_signal("l1/saturation"))
-    assert math.isnan(runs[bare].final_signal("l1/u_a"))
     assert math.isnan(runs[bare].milliseconds_per_step)
 
 

@@ -19,6 +19,7 @@ from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.report import curves, evaluation_figures, report
 from torchrl_l1.report.curves import plot_task
 from torchrl_l1.report.evaluations import evaluation_rows
+from torchrl_l1.report.identity import facts
 from torchrl_l1.report.runs import find_readable_runs, find_runs
 from torchrl_l1.report.stages import plot_stages, stage_rows
 from torchrl_l1.report.study import Study, studies
@@ -353,7 +354,7 @@ def test_time_is_told_stage_by_stage(write_mbmf: WriteRun, tmp_path: Path) -> No
     ]
     assert rows["shooting"]["ms_per_step"] == pytest.approx(40_000 / 5000)
     assert rows["cloning"]["ms_per_step"] == pytest.approx(9000 / 3400)
-    assert "| stage |" in time_table(list(rows.values())).splitlines()[0]
+    assert "| stage |" in time_table(list(rows.values()), facts("mbmf")).splitlines()[0]
 
 
 def test_report_puts_table_4_beside_the_returns_and_has_the_stages(

@@ -8,6 +8,7 @@ import pytest
 import scipy.stats
 from scipy.stats import trim_mean
 
+from torchrl_l1.report.identity import facts
 from torchrl_l1.report.runs import find_runs
 from torchrl_l1.report.study import Study, studies
 from torchrl_l1.report.training import (
@@ -158,7 +159,9 @@ def test_time_rows_are_medians_of_finished_runs(write_run: WriteRun, tmp_path: P
     assert (row["fit"], row["trpo"], row["collect"], row["evaluate"]) == (4.0, 2.0, 0.25, 100.0)
     # (1 + 9) / 2 or (3 + 5) / 2, and 2.75 for the other phases, in 1500 steps an iteration.
     assert row["ms_per_step"] == pytest.approx(1000 * np.mean([15.5, 13.5]) / 3000)
-    assert "| inverted_pendulum | none | off | 2 | 4 | 2 | 0.25 | 100 | 4.83 |" in time_table([row])
+    assert "| inverted_pendulum | none | off | 2 | 4 | 2 | 0.25 | 100 | 4.83 |" in (
+        time_table([row], facts("metrpo"))
+    )
 
 
 def test_times_are_those_of_the_phases_that_there_are(write_run: WriteRun, tmp_path: Path) -> None:
@@ -173,7 +176,7 @@ def test_times_are_those_of_the_phases_that_there_are(write_run: WriteRun, tmp_p
     assert "trpo" not in row
     # Two times 5 seconds and the random data, for 300 steps.
     assert row["ms_per_step"] == pytest.approx(1000 * 10.5 / 300)
-    assert time_table([row]).splitlines()[0] == (
+    assert time_table([row], study.facts).splitlines()[0] == (
         "| task | noise | L1 | runs | fit, s | collection, s | measuring returns, s "
         "| training, ms per real step |"
     )

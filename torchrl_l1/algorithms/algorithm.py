@@ -183,7 +183,7 @@ class Algorithm(ABC):
             name: one of ``facts.phases``.
             words: on what is going on; those of the phase by default.
         """
-        self.on_phase(words or self.facts.phases[name])
+        self.on_phase(words or self.facts.phases[name].words)
         start = perf_counter()
         yield
         self._seconds[name] += perf_counter() - start

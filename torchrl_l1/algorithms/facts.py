@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 KINDS = ("stochastic", "deterministic")
 """The ways to act: with sampled actions, and with mean actions."""
@@ -25,15 +26,45 @@ class Stage:
         name: as users type it; that of what acts in it.
         words: in headings.
         window: outer iterations at its end that its return is the mean of.
-        policies: kinds of policies whose returns a run logs in it.
+        kinds: ways to act whose returns a run logs in it.
         is_planner: whether what acts is a planner, whose sampled and mean actions are the same.
+        with_l1: whether L1 augments the actions in it, if it is on.
     """
 
     name: str
     words: str = ""
     window: int = WINDOW
-    policies: tuple[str, ...] = KINDS
+    kinds: tuple[str, ...] = KINDS
     is_planner: bool = False
+    with_l1: bool = True
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A phase of an outer iteration.
+
+    Attributes:
+        words: that a progress bar shows.
+        heading: of its column in a report's table of times; that has none for it if empty.
+    """
+
+    words: str
+    heading: str = ""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A form of an algorithm that reports show as an algorithm of its own.
+
+    Attributes:
+        name: in headings and tables.
+        color: of its lines where algorithms are compared.
+        settings: values of the dotted keys that make a run one of it.
+    """
+
+    name: str
+    color: str
+    settings: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -44,23 +75,25 @@ class AlgorithmFacts:
         name: in headings and tables.
         stages: in turn; where there are several, ``stage`` in the metrics counts them from 1.
         phases: columns of ``timing.csv``, in the order in which an outer iteration goes through
-            them, with the words that a progress bar shows.
+            them.
         metrics: columns of ``metrics.csv`` with their meaning; ``l1/...`` only with L1 on.
         color: of its lines where algorithms are compared.
         tables: numbers of the paper's tables of it: of the returns of the ``training``, and of the
             evaluations ``sim_to_real`` and ``ablation``.
         compares_models: whether the paper compares forms of the model with it (Figure 2).
         reference_logs: whether the authors have released logs of it.
+        variants: its forms that count as algorithms of their own, by the name of each.
     """
 
     name: str
     stages: tuple[Stage, ...]
-    phases: Mapping[str, str]
+    phases: Mapping[str, Phase]
     metrics: Mapping[str, str]
     color: str
     tables: Mapping[str, str] = field(default_factory=dict)
     compares_models: bool = False
     reference_logs: bool = False
+    variants: Mapping[str, Variant] = field(default_factory=dict)
 
     @property
     def stage_names(self) -> tuple[str, ...]:
@@ -78,14 +111,29 @@ class AlgorithmFacts:
         return not self.stages[-1].is_planner
 
     @property
-    def policies(self) -> Mapping[str, str]:
+    def kinds(self) -> Mapping[str, str]:
         """The ways to act whose returns differ, and in words; one without words if no choice."""
         return _WORDS if self.samples else {KINDS[0]: ""}
 
     @property
+    def l1_words(self) -> str:
+        """The stages in which L1 augments the actions, in words."""
+        return " and ".join(stage.words for stage in self.stages if stage.with_l1)
+
+    @property
+    def timed_phases(self) -> Mapping[str, str]:
+        """The phases that a report's table of times shows, with the headings of their columns."""
+        return {name: phase.heading for name, phase in self.phases.items() if phase.heading}
+
+    @property
     def mean_action_stages(self) -> tuple[int, ...]:
         """Places of the stages in which a run logs the return of either way to act."""
-        return tuple(i for i, stage in enumerate(self.stages) if len(stage.policies) > 1)
+        return tuple(i for i, stage in enumerate(self.stages) if len(stage.kinds) > 1)
+
+    def of_variant(self, name: str) -> AlgorithmFacts:
+        """What is known of one of the variants: all else is as of the algorithm."""
+        variant = self.variants[name]
+        return replace(self, name=variant.name, color=variant.color, variants={})
 
     def acts_in_one_way(self, stage: str = "") -> bool:
         """Whether sampled and mean actions are the same in a stage; any name may be asked for."""

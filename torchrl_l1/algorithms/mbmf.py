@@ -32,7 +32,7 @@ from torchrl_l1.algorithms.collection import (
     signal_metrics,
 )
 from torchrl_l1.algorithms.config import episode_length, make_sampler
-from torchrl_l1.algorithms.facts import AlgorithmFacts
+from torchrl_l1.algorithms.facts import AlgorithmFacts, Phase
 from torchrl_l1.algorithms.fine_tuning import FINE_TUNING_METRICS, FineTuning, exploring
 from torchrl_l1.algorithms.mbmf_config import STAGES, MBMFConfig
 from torchrl_l1.algorithms.model_learning import ModelLearning
@@ -68,12 +68,12 @@ class MBMF(Algorithm):
         name="MBMF",
         stages=STAGES,
         phases={
-            "random": "random data",
-            "fit": "fit",
-            "clone": "cloning",
-            "tune": "PPO",
-            "collect": "collecting",
-            "evaluate": "evaluating",
+            "random": Phase("random data"),
+            "fit": Phase("fit", "fit"),
+            "clone": Phase("cloning", "cloning"),
+            "tune": Phase("PPO", "PPO"),
+            "collect": Phase("collecting", "collection"),
+            "evaluate": Phase("evaluating", "measuring returns"),
         },
         metrics={
             **COMMON_METRICS,
@@ -125,24 +125,27 @@ class MBMF(Algorithm):
         self.cloning = Cloning(self.clone, config.cloning, half, collected)
 
     def _open_environments(self) -> None:
-        """What collects and what measures in each stage; L1 is around the planner alone."""
+        """What collects and what measures in each stage, with L1 in those that it acts in."""
         config, steps = self.config, self.episode_steps
+        shooting, cloning, fine_tuning = (
+            self.real if stage.with_l1 else partial(self.real, l1=None) for stage in STAGES
+        )
         random_steps = episode_length(config.random_steps or steps, self.horizon)
-        planned = partial(self.real, policy=self.planner)
+        planned = partial(shooting, policy=self.planner)
         self.start = planned(episodes=config.random_episodes, horizon=random_steps)
         self.shooting = planned(episodes=config.shooting_episodes, horizon=steps)
         self.shooting_measured = planned(episodes=config.shooting_episodes, horizon=self.horizon)
 
-        bare = partial(self.real, l1=None)
-        measured = partial(bare, episodes=config.evaluation_episodes, horizon=self.horizon)
         visiting = self.clone if config.cloning.label_states == "current" else self.initial
-        explorer = exploring(self.policy, self.task)
-        self.visits = bare(
+        full = {"episodes": config.evaluation_episodes, "horizon": self.horizon}
+        self.visits = cloning(
             policy=acting(visiting, self.task), episodes=config.cloning.episodes, horizon=steps
         )
-        self.clone_measured = measured(policy=acting(self.clone, self.task))
-        self.practice = bare(policy=explorer, episodes=config.fine_tuning.episodes, horizon=steps)
-        self.policy_measured = measured(policy=explorer)
+        self.clone_measured = cloning(policy=acting(self.clone, self.task), **full)
+
+        explored = partial(fine_tuning, policy=exploring(self.policy, self.task))
+        self.practice = explored(episodes=config.fine_tuning.episodes, horizon=steps)
+        self.policy_measured = explored(**full)
 
     def iterate(self) -> Iterator[IterationResult]:
         """Run the outer iterations that are left, of all stages, reporting after each."""

@@ -19,10 +19,10 @@ from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.planning import ShootingConfig
 
 STAGES = (
-    Stage("shooting", "random shooting", policies=("stochastic",), is_planner=True),
+    Stage("shooting", "random shooting", kinds=("stochastic",), is_planner=True),
     # Each of its rounds fits the policy anew to all that is known by then.
-    Stage("cloning", "cloning", window=1, policies=("deterministic",)),
-    Stage("fine_tuning", "fine-tuning"),
+    Stage("cloning", "cloning", window=1, kinds=("deterministic",), with_l1=False),
+    Stage("fine_tuning", "fine-tuning", with_l1=False),
 )
 """The stages in turn."""
 

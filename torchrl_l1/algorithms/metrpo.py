@@ -22,7 +22,7 @@ from torchrl_l1.algorithms.algorithm import (
     Surroundings,
 )
 from torchrl_l1.algorithms.collection import L1_METRICS, policy_returns, signal_metrics
-from torchrl_l1.algorithms.facts import AlgorithmFacts, Stage
+from torchrl_l1.algorithms.facts import AlgorithmFacts, Phase, Stage
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig, check_clipping
 from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.policy import GaussianPolicy, acting
@@ -56,11 +56,11 @@ class METRPO(Algorithm):
         name="METRPO",
         stages=(Stage("policy"),),
         phases={
-            "random": "random data",
-            "fit": "fit",
-            "trpo": "TRPO",
-            "collect": "collecting",
-            "evaluate": "evaluating",
+            "random": Phase("random data"),
+            "fit": Phase("fit", "fit"),
+            "trpo": Phase("TRPO", "TRPO"),
+            "collect": Phase("collecting", "collection"),
+            "evaluate": Phase("evaluating", "measuring returns"),
         },
         metrics={
             **COMMON_METRICS,

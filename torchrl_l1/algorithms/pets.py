@@ -10,7 +10,6 @@ what is learned is the model. With L1 on, the adaptive controller augments the p
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from functools import partial
 from typing import Any, Unpack
 
@@ -25,7 +24,7 @@ from torchrl_l1.algorithms.algorithm import (
 )
 from torchrl_l1.algorithms.collection import L1_METRICS, returns_of_one_way, signal_metrics
 from torchrl_l1.algorithms.config import episode_length, make_sampler
-from torchrl_l1.algorithms.facts import AlgorithmFacts, Stage
+from torchrl_l1.algorithms.facts import AlgorithmFacts, Phase, Stage, Variant
 from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.pets_config import PETSConfig
 from torchrl_l1.control import L1Config
@@ -48,12 +47,12 @@ class PETS(Algorithm):
     config: PETSConfig
     facts = AlgorithmFacts(
         name="PETS",
-        stages=(Stage("planner", policies=("stochastic",), is_planner=True),),
+        stages=(Stage("planner", kinds=("stochastic",), is_planner=True),),
         phases={
-            "random": "random data",
-            "fit": "fit",
-            "collect": "planning and collecting",
-            "evaluate": "evaluating",
+            "random": Phase("random data"),
+            "fit": Phase("fit", "fit"),
+            "collect": Phase("planning and collecting", "collection"),
+            "evaluate": Phase("evaluating", "measuring returns"),
         },
         metrics={
             **COMMON_METRICS,
@@ -67,6 +66,8 @@ class PETS(Algorithm):
             **L1_METRICS,
         },
         color="#CC79A7",
+        # With members that predict points.
+        variants={"dets": Variant("DETS", "#009E73", {"model.head": "deterministic"})},
     )
 
     def __init__(
@@ -145,7 +146,3 @@ class PETS(Algorithm):
         """Continue from :meth:`state_dict`."""
         super().load_state_dict(state)
         self.fit_report = state["fit_report"]
-
-
-DETS = replace(PETS.facts, name="DETS", color="#009E73")
-"""PETS with members that predict points: reports show it as an algorithm of its own."""

@@ -32,7 +32,6 @@ from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.experiment.settings import RunSettings, WandbSettings
 from torchrl_l1.report.evaluation_figures import RANGES, plot_disturbances
 from torchrl_l1.report.evaluation_summary import summarize, summary_tables
-from torchrl_l1.report.identity import facts
 
 _SECONDS_SHOWN = 4.0
 _COLUMNS = 10
@@ -177,9 +176,13 @@ def evaluate_command(options: argparse.Namespace) -> None:
     print(f"\n{summary_tables(summary)}\n")
     write_table(output / "evaluation.csv", rows)
     write_table(output / "summary.csv", summary)
-    recipe = runs[0].recipe
     plot_disturbances(
-        summary, recipe.recipe, output / "robustness.png", facts(recipe.algorithm), (RANGES,), True
+        summary,
+        runs[0].recipe.recipe,
+        output / "robustness.png",
+        runs[0].algorithm.facts,
+        (RANGES,),
+        always=True,
     )
     print(f"Table: {output / 'evaluation.csv'}, {output / 'summary.csv'}")
     print(f"Plot: {output / 'robustness.png'}")

@@ -14,7 +14,7 @@ import numpy as np
 
 
 def render(model: mujoco.MjModel, qpos: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Draws one image for each pose.
+    """Draw one image for each pose.
 
     Args:
         model: the MuJoCo model; its camera "track" is used if it has one.

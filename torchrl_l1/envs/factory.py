@@ -29,7 +29,7 @@ def make_env(
     threads: int = 1,
     **disturbances: float | Sequence[float],
 ) -> TransformedEnv:
-    r"""Builds a benchmark environment with noise, disturbances and further transforms.
+    r"""Build a benchmark environment with noise, disturbances and further transforms.
 
     The transforms stand in the order ``[ActuatorGain, ActuatorBias, ActionNoise,
     ObservationNoise, *extra_transforms]``, neutral ones left out. Actions travel from the last to

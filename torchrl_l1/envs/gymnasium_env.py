@@ -61,7 +61,7 @@ class MujocoTaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.task = task = get_task(task)
         modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in modes:
-            raise ValueError(f"render_mode must be None or one of {modes}, got {render_mode!r}.")
+            raise ValueError(f"render_mode must be None or one of {modes}, got {render_mode!r}")
         self.metadata = {**self.metadata, "render_fps": round(1 / task.dt)}
         self.render_mode = render_mode
         self.width, self.height = width, height
@@ -72,7 +72,7 @@ class MujocoTaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode.
+        """Start an episode.
 
         Args:
             seed: seed of this and all following resets; they continue from the last seed if
@@ -88,7 +88,7 @@ class MujocoTaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._observation(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Advances by one environment step of ``task.dt`` seconds.
+        """Advance by one environment step of ``task.dt`` seconds.
 
         Args:
             action: actuator inputs ``(m,)``.
@@ -102,7 +102,7 @@ class MujocoTaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """
         if np.shape(action) != self.action_space.shape:
             raise ValueError(
-                f"action has shape {np.shape(action)}, expected {self.action_space.shape}."
+                f"action has shape {np.shape(action)}, expected {self.action_space.shape}"
             )
         values = torch.as_tensor(np.asarray(action, dtype=np.float64))
         reward, terminated, bad = self._simulation.step(values.unsqueeze(0))
@@ -115,7 +115,7 @@ class MujocoTaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return simulator.qpos[0].copy(), simulator.qvel[0].copy()
 
     def set_simulator_state(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        """Starts an episode from a given state; call it after ``reset``.
+        """Start an episode from a given state; call it after ``reset``.
 
         Args:
             qpos: positions ``(nq,)``.
@@ -165,12 +165,12 @@ class MujocoTaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             return mujoco.Renderer(model, self.height, self.width)
         except Exception as error:  # every OpenGL binding has exceptions of its own
             raise RuntimeError(
-                "MuJoCo cannot draw off screen here. Set the environment variable MUJOCO_GL to egl "
-                "or osmesa before Python starts, and install that backend (libegl1, libosmesa6)."
+                "MuJoCo cannot draw off screen here; set the environment variable MUJOCO_GL to egl "
+                "or osmesa before Python starts, and install that backend (libegl1, libosmesa6)"
             ) from error
 
     def close(self) -> None:
-        """Frees the renderer, if there is one."""
+        """Free the renderer, if there is one."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None

@@ -69,7 +69,7 @@ class BatchedMujocoEnv(EnvBase):
         counts = {"num_envs": num_envs, "max_steps": max_steps, "threads": threads}
         for name, value in counts.items():
             if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}.")
+                raise ValueError(f"{name} must be at least 1, got {value}")
         super().__init__(device="cpu", batch_size=[num_envs])
         self.task = task
         self.num_envs = num_envs
@@ -114,7 +114,7 @@ class BatchedMujocoEnv(EnvBase):
         return simulator.qpos.copy(), simulator.qvel.copy()
 
     def set_simulator_state(self, qpos: np.ndarray, qvel: np.ndarray) -> Tensor:
-        """Starts a new episode in every environment from a given simulator state.
+        """Start a new episode in every environment from a given simulator state.
 
         For comparisons and rendering. Transforms are not told: those that keep a state of their
         own (a step counter, a controller) need an ordinary reset first.

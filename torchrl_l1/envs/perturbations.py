@@ -21,7 +21,7 @@ class _UniformNoise(Transform):
         if not (half_width >= 0 and math.isfinite(half_width)):
             raise ValueError(
                 f"{type(self).__name__}: half_width must be finite and not negative, "
-                f"got {half_width}."
+                f"got {half_width}"
             )
         self.half_width = float(half_width)
         self.key = key
@@ -30,14 +30,14 @@ class _UniformNoise(Transform):
         return value + torch.empty_like(value).uniform_(-self.half_width, self.half_width)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Refuses to work on stored data.
+        """Refuse to work on stored data.
 
         Raises:
             RuntimeError: always.
         """
         raise RuntimeError(
             f"{type(self).__name__} belongs to an environment (TransformedEnv), not to a replay "
-            "buffer or a policy: noise must enter the data once, while they are collected."
+            "buffer or a policy: noise must enter the data once, while they are collected"
         )
 
     def __repr__(self) -> str:
@@ -45,7 +45,7 @@ class _UniformNoise(Transform):
 
 
 class ActionNoise(_UniformNoise):
-    r"""Adds :math:`\xi \sim U(-w, w)`, independent per entry and step, to the action.
+    r"""Noise :math:`\xi \sim U(-w, w)` on the action, independent per entry and step.
 
     The action in the rollout stays noise-free: only what travels on to the base environment
     changes. The sum is not clipped again (MuJoCo clamps limited actuators), and the reward's
@@ -80,7 +80,7 @@ class ActionNoise(_UniformNoise):
 
 
 class ObservationNoise(_UniformNoise):
-    r"""Adds :math:`U(-w, w)`, independent per entry and step, to the observation after a step.
+    r"""Noise :math:`U(-w, w)` on the observation after a step, independent per entry and step.
 
     The observation of a reset stays clean; reward and termination were computed from the clean
     state. Everything downstream (policy, L1, data set) sees the noisy observation. All of this is
@@ -117,7 +117,7 @@ class _ActuatorDisturbance(Transform):
         if tensor.ndim > 1 or not tensor.isfinite().all():
             raise ValueError(
                 f"{type(self).__name__} needs a finite number, or one for each action entry, "
-                f"got {value!r}."
+                f"got {value!r}"
             )
         self.register_buffer("value", tensor)
         self.action_key = action_key
@@ -128,19 +128,19 @@ class _ActuatorDisturbance(Transform):
         if self.value.ndim and self.value.shape[-1] != action.shape[-1]:
             raise ValueError(
                 f"{type(self).__name__} has {self.value.shape[-1]} values, but the action "
-                f"{self.action_key!r} has {action.shape[-1]} entries."
+                f"{self.action_key!r} has {action.shape[-1]} entries"
             )
         return tensordict.set(self.action_key, self._disturb(action, self.value.to(action)))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Refuses to work on stored data.
+        """Refuse to work on stored data.
 
         Raises:
             RuntimeError: always.
         """
         raise RuntimeError(
             f"{type(self).__name__} belongs to an environment (TransformedEnv), not to a replay "
-            "buffer or a policy: it changes what an environment executes."
+            "buffer or a policy: it changes what an environment executes"
         )
 
     def __repr__(self) -> str:
@@ -148,7 +148,7 @@ class _ActuatorDisturbance(Transform):
 
 
 class ActuatorBias(_ActuatorDisturbance):
-    """Adds a constant to every action that the environment executes: ``u + bias``.
+    """A constant on top of every action that the environment executes: ``u + bias``.
 
     The textbook matched disturbance: L1 estimates and cancels it. The action in the rollout is
     unchanged.
@@ -174,7 +174,7 @@ class ActuatorBias(_ActuatorDisturbance):
 
 
 class ActuatorGain(_ActuatorDisturbance):
-    """Multiplies every action that the environment executes: ``gain * u``.
+    """A factor on every action that the environment executes: ``gain * u``.
 
     A weakened (or overdriven) actuator. The action in the rollout is unchanged.
 
@@ -206,7 +206,6 @@ class Disturbance:
         neutral: the value that changes nothing.
         units: of its values, in words.
         help: what its values are, in words.
-        matched: whether it acts as an input of the actuators would, so that L1 can cancel it.
     """
 
     setting: str
@@ -215,7 +214,6 @@ class Disturbance:
     neutral: float
     units: str
     help: str
-    matched: bool
 
     @property
     def words(self) -> str:
@@ -230,11 +228,10 @@ def disturbance(
     neutral: float,
     units: str,
     help: str,
-    matched: bool,
 ) -> Any:
     """A field of :class:`Perturbation` that is a :class:`Disturbance`, neutral by default."""
     described = {"name": name, "transform": transform, "neutral": neutral}
-    described |= {"units": units, "help": help, "matched": matched}
+    described |= {"units": units, "help": help}
     return field(default=neutral, metadata={_DISTURBANCE: described})
 
 
@@ -267,10 +264,10 @@ class Perturbation:
     observation_noise: float = 0.0
     actuator_bias: float = disturbance(
         "bias", ActuatorBias, neutral=0.0, units="action units",
-        help="actuator biases, action units", matched=True,
+        help="actuator biases, action units",
     )  # fmt: skip
     actuator_gain: float = disturbance(
-        "gain", ActuatorGain, neutral=1.0, units="factor", help="actuator gains", matched=True
+        "gain", ActuatorGain, neutral=1.0, units="factor", help="actuator gains"
     )
 
     def __post_init__(self) -> None:

@@ -54,7 +54,7 @@ def _decorated(task: Task) -> mujoco.MjModel:
 def rollout_frames(
     task: str | Task, qpos: np.ndarray, *, size: tuple[int, int] = (240, 180)
 ) -> list[np.ndarray]:
-    """Draws the poses of a rollout, in a process of its own.
+    """Draw the poses of a rollout, in a process of its own.
 
     The poses can be recorded with ``rollout``'s callback:
     ``env.rollout(100, policy, callback=lambda env, _: poses.append(env.simulator_state()[0][0]))``.
@@ -77,7 +77,7 @@ def rollout_frames(
     task = get_task(task)
     model = _decorated(task)
     if np.ndim(qpos) != 2 or np.shape(qpos)[1] != model.nq:
-        raise ValueError(f"qpos has shape {np.shape(qpos)}, expected (T, {model.nq}).")
+        raise ValueError(f"qpos has shape {np.shape(qpos)}, expected (T, {model.nq})")
     reports = []
     with tempfile.TemporaryDirectory() as folder:
         arrays, binary, output = (str(Path(folder, n)) for n in ("in.npz", "model.mjb", "out.npy"))
@@ -112,12 +112,12 @@ def rollout_frames(
 
 def _checked(rows: Mapping[str, Sequence[np.ndarray]], every: int) -> dict[str, list[np.ndarray]]:
     if every < 1:
-        raise ValueError(f"every must be at least 1, got {every}.")
+        raise ValueError(f"every must be at least 1, got {every}")
     shapes = {np.shape(frame) for frames in rows.values() for frame in frames}
     if len(shapes) != 1 or not all(len(frames) for frames in rows.values()):
         raise ValueError(
             "Every row needs at least one frame, and all frames one shape; found "
-            f"{ {label: len(frames) for label, frames in rows.items()} } of shapes {shapes}."
+            f"{ {label: len(frames) for label, frames in rows.items()} } of shapes {shapes}"
         )
     return {label: list(frames)[::every] for label, frames in rows.items()}
 
@@ -129,7 +129,7 @@ def filmstrip(
     every: int = 1,
     dt: float | None = None,
 ) -> Path:
-    """Writes a labelled picture with one row of frames for each rollout.
+    """Write a labelled picture with one row of frames for each rollout.
 
     Args:
         rows: frames ``(height, width, 3)`` of each rollout, by the label to print beside them.
@@ -173,7 +173,7 @@ def animation(
     every: int = 1,
     dt: float = 0.04,
 ) -> Path:
-    """Writes a looping GIF with the rollouts one below the other, in real time.
+    """Write a looping GIF with the rollouts one below the other, in real time.
 
     A rollout that is shorter than the others holds its last frame.
 

@@ -68,7 +68,7 @@ class BatchedSimulator:
     def set_state(
         self, qpos: np.ndarray, qvel: np.ndarray, indices: Sequence[int] | np.ndarray | None = None
     ) -> None:
-        """Puts environments into given states and forgets their history (time, warm start).
+        """Put environments into given states and forget their history (time, warm start).
 
         Args:
             qpos: positions ``(K, nq)``.
@@ -83,17 +83,17 @@ class BatchedSimulator:
             if np.shape(value) != (len(chosen), size):
                 raise ValueError(
                     f"{name} has shape {np.shape(value)}, expected {(len(chosen), size)}: "
-                    f"one row for each of the {len(chosen)} environments that are set."
+                    f"one row for each of the {len(chosen)} environments that are set"
                 )
             if not np.isfinite(value).all():
-                raise ValueError(f"{name} has entries that are not finite.")
+                raise ValueError(f"{name} has entries that are not finite")
         self.batch.reset(chosen, stage=_NO_STAGE)
         self.qpos[chosen] = qpos
         self.qvel[chosen] = qvel
         self.batch.forward(chosen)
 
     def step(self, control: np.ndarray) -> np.ndarray:
-        """Advances every environment by one environment step.
+        """Advance every environment by one environment step.
 
         Where the simulation turns bad (MuJoCo's warnings of a bad position, velocity or
         acceleration, upon which it silently restarts from the XML's pose), the environment is put
@@ -125,7 +125,7 @@ class BatchedSimulator:
 
 
 class StartStates:
-    """Draws clean initial observations of a task, without stepping any physics.
+    """Clean initial observations of a task, drawn without stepping any physics.
 
     Randomness follows torch's global generator, like the rest of an imagined rollout.
 
@@ -185,7 +185,7 @@ class TaskSimulation:
         return torch.tensor(self.task.observe(simulator.qpos, simulator.qvel, previous_qpos))
 
     def reset(self, rng: np.random.Generator, indices: np.ndarray) -> None:
-        """Starts new episodes in some environments and leaves the others alone."""
+        """Start new episodes in some environments and leave the others alone."""
         if indices.size:
             qpos, qvel = self.task.sample_reset(rng, *self._initial, indices.size)
             self.set_state(qpos, qvel, indices)
@@ -193,7 +193,7 @@ class TaskSimulation:
     def set_state(
         self, qpos: np.ndarray, qvel: np.ndarray, indices: np.ndarray | None = None
     ) -> None:
-        """Starts new episodes from given states, in all environments or in some.
+        """Start new episodes from given states, in all environments or in some.
 
         Raises:
             ValueError: if a shape is wrong or a number is not finite.
@@ -207,7 +207,7 @@ class TaskSimulation:
         self.observation = torch.where(chosen, fresh, self.observation)
 
     def step(self, action: Tensor) -> TaskStep:
-        """Advances every environment by one environment step.
+        """Advance every environment by one environment step.
 
         An environment whose simulation turns bad keeps its state and its observation.
 
@@ -230,7 +230,7 @@ class TaskSimulation:
     def _checked(self, action: Tensor) -> Tensor:
         expected = (self.simulator.num_envs, self.task.action_dim)
         if tuple(action.shape) != expected:
-            raise ValueError(f"'action' has shape {tuple(action.shape)}, expected {expected}.")
+            raise ValueError(f"'action' has shape {tuple(action.shape)}, expected {expected}")
         action = action.detach().to(torch.float64)
         magnitude = np.abs(action.numpy())
         # Written so that NaN fails too; MuJoCo would replace such an input by zero.
@@ -238,6 +238,6 @@ class TaskSimulation:
             index = int(np.flatnonzero(~(magnitude <= MAX_MAGNITUDE).all(1))[0])
             raise ValueError(
                 f"'action' of environment {index} is {action[index].tolist()}: every entry must "
-                f"be finite and at most {MAX_MAGNITUDE:g} in magnitude. Check the policy's output."
+                f"be finite and at most {MAX_MAGNITUDE:g} in magnitude; check the policy's output"
             )
         return action

@@ -103,14 +103,14 @@ class Task:
         return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / self.model_file
 
     def build_spec(self) -> mujoco.MjSpec:
-        """Reads and patches the XML, without compiling it."""
+        """Read and patch the XML, without compiling it."""
         spec = mujoco.MjSpec.from_file(str(self.model_path))
         if self.patch is not None:
             self.patch(spec)
         return spec
 
     def build_model(self, spec: mujoco.MjSpec | None = None) -> mujoco.MjModel:
-        """Compiles the MuJoCo model.
+        """Compile the MuJoCo model.
 
         Args:
             spec: what to compile instead of :meth:`build_spec`, for example with decorations.
@@ -131,12 +131,12 @@ class Task:
         if found != (self.timestep, self.action_dim):
             raise ValueError(
                 f"Task {self.name!r}: {self.model_path} has (timestep, actuators) = {found}, but "
-                f"the task says {(self.timestep, self.action_dim)}. Correct the task or patch it."
+                f"the task says {(self.timestep, self.action_dim)}; correct the task or patch it"
             )
         bounds = (self.action_low, self.action_high)
         if not np.array_equal(model.actuator_ctrlrange, np.tile(bounds, (model.nu, 1))):
             raise ValueError(
                 f"Task {self.name!r}: {self.model_path} has the actuator ranges "
-                f"{model.actuator_ctrlrange.tolist()}, but the task's action bounds are {bounds}."
+                f"{model.actuator_ctrlrange.tolist()}, but the task's action bounds are {bounds}"
             )
         return model

@@ -143,7 +143,7 @@ def cartpole_reward(observation: Tensor, action: Tensor, next_observation: Tenso
 
 
 def unclamp_actuators(spec: mujoco.MjSpec) -> None:
-    """Lets actuators follow inputs beyond their ``ctrlrange``, which stays what it is."""
+    """Let actuators follow inputs beyond their ``ctrlrange``, which stays what it is."""
     for actuator in spec.actuators:
         actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
 
@@ -280,7 +280,7 @@ TASKS: dict[str, Task] = {
 
 
 def get_task(task: str | Task) -> Task:
-    """Looks a task up by name; a :class:`~torchrl_l1.envs.Task` passes through.
+    """Look a task up by name; a :class:`~torchrl_l1.envs.Task` passes through.
 
     Args:
         task: a key of :data:`TASKS`, or a task of your own.
@@ -294,5 +294,5 @@ def get_task(task: str | Task) -> Task:
     if isinstance(task, Task):
         return task
     if task not in TASKS:
-        raise KeyError(f"Unknown task {task!r}. Available: {', '.join(sorted(TASKS))}.")
+        raise KeyError(f"Unknown task {task!r}. Available: {', '.join(sorted(TASKS))}")
     return TASKS[task]

@@ -245,9 +245,7 @@ def plot_algorithms(
                 runs,
                 style=arm_style(cell.arm, arms),
             )
-            for study in studies
-            for cell, runs in study.cells.items()
-            if (cell.task, cell.noise, cell.variant) == (task, noise, ())
+            for study, cell, runs in _cells(studies, task, noise)
         ]
         panels.append(Panel(title(task, noise), lines))
     return plot_panels(panels, file)

@@ -29,7 +29,7 @@ from torchrl_l1.report.style import (
 
 Row = Mapping[str, Any]
 
-PHASES = ("neither", "training only", "testing only", "both")
+L1_IN = ("neither", "training only", "testing only", "both")
 """Where L1 is on, in the order in which tables and figures show it."""
 
 _AXES = {
@@ -57,7 +57,7 @@ def plot_ablation(rows: Sequence[Row], file: Path, name: str = "") -> Path:
         noises = sorted({row["noise"] for row in mine}, key=noise_order)
         fit_scale([axis], [_values(row) for row in mine])
         for row in mine:
-            index = PHASES.index(row["phase"])
+            index = L1_IN.index(row["phase"])
             x = noises.index(row["noise"]) + (index - 1.5) * 0.2
             _bar(axis, x, row, color(index))
         axis.axhline(0, color="black", linewidth=0.8)
@@ -122,10 +122,9 @@ def plot_disturbances(
 ) -> Path | None:
     """Return against each disturbance, one line per controller.
 
-    There is a panel per stage, policy, noise and disturbance. The band of a return is the 95 %
-    interval of the mean over training seeds. These differ more from each other than L1 off from
-    L1 on, so below each return stands the difference, policy by policy, with the interval of its
-    own mean.
+    There is a panel per stage, policy, noise and disturbance for each of ``shown``, one below the
+    other, with its line and band. Returns of training seeds differ more from each other than L1
+    off from L1 on, so by default the difference, policy by policy, stands below each return.
 
     Args:
         rows: tested under several values of disturbances; in a report, of one cell and stage of

@@ -11,7 +11,7 @@ from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.matrix import undisturbed
 from torchrl_l1.report.evaluation_figures import (
-    PHASES,
+    L1_IN,
     plot_ablation,
     plot_disturbances,
     plot_tuning,
@@ -31,7 +31,7 @@ from torchrl_l1.report.page import (
 from torchrl_l1.report.published import published_cell
 from torchrl_l1.report.reading import Evaluation, condition_columns
 from torchrl_l1.report.runs import Run
-from torchrl_l1.report.statistics import difference_summary, mean_interval
+from torchrl_l1.report.statistics import difference_summary, mean_summary
 from torchrl_l1.report.study import Study, noise_order, variant_text
 from torchrl_l1.report.style import arm_label, named, noise_words, title
 
@@ -180,7 +180,7 @@ def _evaluation_tables(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row
 
 def _by_actions(algorithm: AlgorithmFacts, rows: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
     """The rows by how the policies act, in words: those that have no choice first."""
-    groups: dict[str, list[Row]] = {words: [] for words in ("", *algorithm.policies.values())}
+    groups: dict[str, list[Row]] = {words: [] for words in ("", *algorithm.kinds.values())}
     for row in rows:
         groups[algorithm.actions(row["policy"], _stage(row))].append(row)
     yield from ((words, found) for words, found in groups.items() if found)
@@ -256,11 +256,11 @@ def ablation_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         trained, tested = row["training_l1"], row["l1"]
         on = {trained, tested} - {BASELINE}
         if undisturbed(row) and row["training_noise"] == row["noise"] and len(on) < 2:
-            chosen.append({**row, "phase": phase(trained, tested)})
-    return sorted(chosen, key=lambda row: PHASES.index(row["phase"]))
+            chosen.append({**row, "phase": _l1_in(trained, tested)})
+    return sorted(chosen, key=lambda row: L1_IN.index(row["phase"]))
 
 
-def phase(trained: str, tested: str) -> str:
+def _l1_in(trained: str, tested: str) -> str:
     """Where L1 is on: ``neither``, ``training only``, ``testing only`` or ``both``."""
     if trained == BASELINE:
         return "neither" if tested == BASELINE else "testing only"
@@ -286,16 +286,15 @@ def _set_values(test: Evaluation) -> dict[str, Any]:
 
 def _summary(tests: Sequence[tuple[Run, Evaluation]]) -> dict[str, Any]:
     values = [test.return_mean for _, test in tests]
+    mean = mean_summary("return", values)
     result: dict[str, Any] = {
         "training_seeds": len(values),
         "episodes_per_seed": " ".join(sorted({str(test.episodes) for _, test in tests})),
-        "return_mean": float(np.mean(values)),
+        "return_mean": mean.pop("return_mean"),
         "std": float(np.std(values)),
         "return_values": " ".join(f"{value:.6g}" for value in values),
+        **mean,
     }
-    interval = mean_interval(values)
-    if interval is not None:
-        result |= {"return_low": interval.low, "return_high": interval.high}
     switches = 1000 * float(np.mean([test.switch_rate for _, test in tests]))
     if np.isfinite(switches):
         result["switches_per_1000_steps"] = switches
@@ -403,10 +402,10 @@ def ablation_table(rows: Sequence[Row]) -> str:
     keys = ("task", "noise", "variant", "stage")
     for cell, found in grouped(rows, keys, "phase"):
         line = dict(zip(keys, cell, strict=True))
-        line |= {phase: return_text(found.get(phase)) for phase in PHASES}
+        line |= {where: return_text(found.get(where)) for where in L1_IN}
         line["training seeds"] = ", ".join(
             sorted({str(row["training_seeds"]) for row in found.values()})
         )
-        line |= {f"paper, {phase}": paper_text(found.get(phase, {}), notes) for phase in PHASES}
+        line |= {f"paper, {where}": paper_text(found.get(where, {}), notes) for where in L1_IN}
         lines.append(line)
     return notes.below(markdown(lines))

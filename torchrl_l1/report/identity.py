@@ -9,19 +9,28 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from torchrl_l1.algorithms import MBMF, METRPO, PETS
 from torchrl_l1.algorithms.facts import AlgorithmFacts
-from torchrl_l1.algorithms.pets import DETS
 from torchrl_l1.control.config import DEFAULT_ALPHA
 from torchrl_l1.experiment.l1_options import closest_option, departures, filter_gain
 from torchrl_l1.experiment.recipes import shared_dir
-from torchrl_l1.experiment.settings import VOLATILE_KEYS, L1Settings, flatten, schema_defaults
+from torchrl_l1.experiment.settings import (
+    SCHEMAS,
+    VOLATILE_KEYS,
+    L1Settings,
+    flatten,
+    schema_defaults,
+)
+
+# Those that learn a policy come before those that only plan, each before its variants.
+_TRAINED = {
+    name: SCHEMAS[name].builds.facts
+    for name in sorted(SCHEMAS, key=lambda name: not SCHEMAS[name].builds.facts.samples)
+}
+_SCHEMA_OF = {shown: name for name, one in _TRAINED.items() for shown in (name, *one.variants)}
 
 ALGORITHMS: Mapping[str, AlgorithmFacts] = {
-    "metrpo": METRPO.facts,
-    "mbmf": MBMF.facts,
-    "pets": PETS.facts,
-    "dets": DETS,
+    shown: _TRAINED[name] if shown == name else _TRAINED[name].of_variant(shown)
+    for shown, name in _SCHEMA_OF.items()
 }
 """By name, see :class:`Identity`, in the order in which a report shows them."""
 
@@ -43,8 +52,8 @@ class Identity:
     """What a run is one sample of.
 
     Attributes:
-        algorithm: ``metrpo``, ``mbmf``, ``pets``, or ``dets`` for PETS with members that predict
-            points.
+        algorithm: that of its recipe, such as ``metrpo``, or the variant that it is of it, such
+            as ``dets`` for PETS with members that predict points.
         task: such as ``half_cheetah``.
         noise: option of the ``noise`` group that its noise is equal to, else what there is of it
             with its half-width, such as ``action 0.3``.
@@ -127,15 +136,17 @@ def identify(config: Mapping[str, Any]) -> Identity:
 
 def default_text(key: str, algorithm: str) -> str | None:
     """A key's default as :class:`Identity` writes values; ``None`` if the schema has none."""
-    schema = schema_defaults({"algorithm": "pets" if algorithm == "dets" else algorithm})
+    schema = schema_defaults({"algorithm": _SCHEMA_OF[algorithm]})
     defaults = {**schema, _FILTER_KEYS[0]: DEFAULT_ALPHA}
     return _text(defaults[key]) if key in defaults else None
 
 
 def _algorithm(settings: Mapping[str, Any]) -> str:
     name = str(settings["algorithm"])
-    points = settings.get("model.head") == "deterministic"
-    return "dets" if name == "pets" and points else name
+    for variant, one in _TRAINED[name].variants.items():
+        if all(settings.get(key) == value for key, value in one.settings.items()):
+            return variant
+    return name
 
 
 def _noise(settings: Mapping[str, Any]) -> str:

@@ -27,6 +27,13 @@ from torchrl_l1.report.reading import (
 
 T = TypeVar("T")
 
+# Columns of tables, with the signal that each shows and a factor.
+_L1_COLUMNS = {
+    "switches_per_1000": ("l1/switch_rate", 1000),
+    "u_a": ("l1/u_a", 1),
+    "saturation": ("l1/saturation", 1),
+}
+
 
 @dataclass
 class Run:
@@ -92,10 +99,6 @@ class Run:
         """The same of the deterministic return."""
         return float(self.deterministic[self.ending].mean())
 
-    def final_signal(self, name: str) -> float:
-        """Mean of a signal of L1 over the same outer iterations; NaN without L1."""
-        return float(self.signals[name][self.ending].mean())
-
     def during(self, position: int) -> np.ndarray:
         """Which outer iterations ``(T,)`` belong to a stage, the first being 0."""
         if self.stage is None:
@@ -117,6 +120,24 @@ class Run:
         """Training time per real step; NaN if unknown."""
         steps = self.real_steps[-1] if len(self.real_steps) else 0
         return float(1000 * self.training_seconds.sum() / steps) if steps else math.nan
+
+
+def l1_means(
+    runs: Sequence[Run], parts: Sequence[np.ndarray], columns: Sequence[str] = tuple(_L1_COLUMNS)
+) -> dict[str, float]:
+    """What L1 did in some outer iterations of each run: means over runs of what is known.
+
+    Args:
+        runs: any number of them.
+        parts: indices of the outer iterations, run by run.
+        columns: which of ``switches_per_1000``, ``u_a`` and ``saturation``.
+    """
+    means = {}
+    for column in columns:
+        signal, factor = _L1_COLUMNS[column]
+        values = [run.signals[signal][part].mean() for run, part in zip(runs, parts, strict=True)]
+        means[column] = float(np.mean([factor * float(value) for value in values]))
+    return {column: mean for column, mean in means.items() if np.isfinite(mean)}
 
 
 @dataclass

@@ -20,12 +20,12 @@ from torchrl_l1.report.page import (
     number,
     return_text,
 )
-from torchrl_l1.report.runs import Run
+from torchrl_l1.report.runs import Run, l1_means
 from torchrl_l1.report.statistics import difference_summary, mean_summary
 from torchrl_l1.report.study import Study, place_columns, with_baselines
 from torchrl_l1.report.style import named, title
 
-_SIGNALS = {"switches_per_1000": ("l1/switch_rate", 1000), "u_a": ("l1/u_a", 1)}
+_L1_COLUMNS = ("switches_per_1000", "u_a")
 
 
 def stage_sections(page: Page, study: Study) -> None:
@@ -40,10 +40,10 @@ def stage_sections(page: Page, study: Study) -> None:
         "Return at the end of each stage: of what acts in it, the mean over its last outer "
         f"iterations ({windows}; fewer where there are fewer); mean ± standard deviation over "
         "seeds, 95 % interval of the mean. Differences are between runs of the same seed and "
-        "settings. L1 acts around the planner of "
-        f"{stages[0].words} and nowhere else: the difference in that stage is what it does there, "
-        "to the actions and through the data that the model is fitted to; the differences in "
-        "the stages after it are what it has done to what they learn.",
+        f"settings. L1 acts around the planner of {study.facts.l1_words} and nowhere else: the "
+        "difference in that stage is what it does there, to the actions and through the data that "
+        "the model is fitted to; the differences in the stages after it are what it has done to "
+        "what they learn.",
     )
     page.text(stage_table(rows))
     page.csv("stages", rows)
@@ -64,7 +64,8 @@ def stage_rows(study: Study) -> list[dict[str, Any]]:
     for cell, runs in study.cells.items():
         for position, stage in enumerate(study.facts.named_stages):
             done = [run for run in runs if run.finished and run.during(position).any()]
-            for policy in stage.policies if done else ():
+            ends = [run.end_of(position, stage.window) for run in done]
+            for policy in stage.kinds if done else ():
                 returns = [stage_return(run, position, stage, policy) for run in done]
                 rows.append(
                     {
@@ -76,7 +77,7 @@ def stage_rows(study: Study) -> list[dict[str, Any]]:
                         "std": float(np.std(returns)),
                         "return_values": " ".join(f"{value:.6g}" for value in returns),
                         "real_steps": round(float(np.mean([_steps(r, position) for r in done]))),
-                        **_signals(done, position, stage),
+                        **l1_means(done, ends, _L1_COLUMNS),
                         **_differences(study, runs, position, stage, policy),
                     }
                 )
@@ -108,16 +109,6 @@ def _differences(
 
 def _steps(run: Run, position: int) -> float:
     return float(run.real_steps[run.end_of(position, 1)].item())
-
-
-def _signals(runs: Sequence[Run], position: int, stage: Stage) -> dict[str, float]:
-    found = {}
-    for name, (signal, factor) in _SIGNALS.items():
-        values = [run.signals[signal][run.end_of(position, stage.window)].mean() for run in runs]
-        mean = factor * float(np.mean(values))
-        if np.isfinite(mean):
-            found[name] = mean
-    return found
 
 
 def stage_table(rows: Sequence[Row]) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.report.curves import Grey, Panel, cell_line, curve_section, plot_panels
 from torchrl_l1.report.identity import BASELINE, facts
 from torchrl_l1.report.page import (
@@ -23,7 +24,7 @@ from torchrl_l1.report.page import (
     spread_text,
 )
 from torchrl_l1.report.published import ReferenceCurves, published_cell
-from torchrl_l1.report.runs import Run
+from torchrl_l1.report.runs import Run, l1_means
 from torchrl_l1.report.stages import stage_sections
 from torchrl_l1.report.statistics import (
     difference_summary,
@@ -33,15 +34,6 @@ from torchrl_l1.report.statistics import (
 )
 from torchrl_l1.report.study import Cell, Study, place_columns, with_baselines
 from torchrl_l1.report.style import arm_label, color, named, title
-
-_PHASES = {
-    "fit": "fit",
-    "trpo": "TRPO",
-    "clone": "cloning",
-    "tune": "PPO",
-    "collect": "collection",
-    "evaluate": "measuring returns",
-}
 
 
 def training_sections(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
@@ -80,8 +72,8 @@ def _training(page: Page, study: Study, reference: ReferenceCurves | None) -> No
 
 
 def _l1_did(study: Study) -> str:
-    if study.facts.named_stages:
-        return f"L1 acts in {study.facts.named_stages[0].words} only; what it did is under Stages."
+    if not study.facts.stages[-1].with_l1:
+        return f"L1 acts in {study.facts.l1_words} only; what it did is under Stages."
     return (
         "What L1 did (switches, mean norm of its input, share of actions that a bound cut) are "
         "means over the same iterations."
@@ -118,7 +110,7 @@ def run_rows(study: Study) -> list[dict[str, Any]]:
             "real_steps": int(run.real_steps[-1]) if len(run.real_steps) else 0,
             "return": run.final if run.finished else None,
             **_deterministic(run, study),
-            **(_signals([run]) if run.finished else {}),
+            **(l1_means([run], [run.ending]) if run.finished else {}),
             "path": str(run.path),
         }
         for cell, runs in study.cells.items()
@@ -145,7 +137,7 @@ def training_row(
         if facts(runs[0].identity.algorithm).samples:
             row |= mean_summary("deterministic", [run.final_deterministic for run in done])
         row["real_steps"] = round(float(np.mean([run.real_steps[-1] for run in done])))
-        row |= _signals(done)
+        row |= l1_means(done, [run.ending for run in done])
     row["unfinished"] = "; ".join(
         f"seed {run.identity.seed}: {run.progress} iterations" for run in runs if not run.finished
     )
@@ -181,7 +173,7 @@ def paired_rows(study: Study) -> list[dict[str, Any]]:
         if cell.arm == BASELINE:
             continue
         pairs, single = with_baselines(study, runs)
-        for policy in study.facts.policies:
+        for policy in study.facts.kinds:
             finals = [
                 (l1.final, off.final)
                 if policy == "stochastic"
@@ -200,17 +192,6 @@ def paired_rows(study: Study) -> list[dict[str, Any]]:
                 }
             )
     return rows
-
-
-def _signals(runs: Sequence[Run]) -> dict[str, float]:
-    """What L1 did at the end of the training; what is known of it."""
-    values = {
-        "switches_per_1000": [1000 * run.final_signal("l1/switch_rate") for run in runs],
-        "u_a": [run.final_signal("l1/u_a") for run in runs],
-        "saturation": [run.final_signal("l1/saturation") for run in runs],
-    }
-    means = {name: float(np.mean(numbers)) for name, numbers in values.items()}
-    return {name: mean for name, mean in means.items() if np.isfinite(mean)}
 
 
 def _deterministic(run: Run, study: Study) -> dict[str, float | None]:
@@ -351,20 +332,20 @@ def _time(page: Page, study: Study) -> None:
         "iterations of the finished runs, and the mean training time per real step. The times are "
         "those of the machine, with whatever else it did.",
     )
-    page.text(time_table(rows))
+    page.text(time_table(rows, study.facts))
     page.csv("time", rows)
 
 
 def time_rows(study: Study) -> list[dict[str, Any]]:
     """Seconds per outer iteration in each phase, for each main cell whose times are known.
 
-    The phases (those of them that the algorithm has) are medians over all outer iterations of all
-    finished runs, and ``ms_per_step`` is the training time per real step of whole runs, random data
-    included and ``evaluate`` left out. Where an algorithm has several stages there is a row for
+    The phases that the table shows are medians over all outer iterations of all finished runs, and
+    ``ms_per_step`` is the training time per real step of whole runs, random data included and
+    ``evaluate`` left out. Where an algorithm has several stages there is a row for
     each, of its iterations and real steps, and ``share`` is its part of the training time.
     """
     rows = []
-    phases = [phase for phase in study.facts.phases if phase in _PHASES]
+    phases = tuple(study.facts.timed_phases)
     for cell, runs in study.cells.items():
         timed = [run for run in runs if run.finished and np.isfinite(run.milliseconds_per_step)]
         if cell.variant or not timed:
@@ -376,8 +357,8 @@ def time_rows(study: Study) -> list[dict[str, Any]]:
         for position, stage in enumerate(study.facts.named_stages):
             during = [run.during(position) for run in timed]
             if any(part.any() for part in during):
-                named = {**place, "stage": stage.name, "runs": len(timed)}
-                rows.append({**named, **_times(timed, during, phases), **_share(timed, during)})
+                whose = {**place, "stage": stage.name, "runs": len(timed)}
+                rows.append({**whose, **_times(timed, during, phases), **_share(timed, during)})
     return rows
 
 
@@ -410,8 +391,9 @@ def _seconds(run: Run, part: np.ndarray | slice = slice(None)) -> float:
     return float(run.training_seconds[part].sum())
 
 
-def time_table(rows: list[dict[str, Any]]) -> str:
-    """The rows as Markdown."""
+def time_table(rows: Sequence[Row], algorithm: AlgorithmFacts) -> str:
+    """The rows of :func:`time_rows` as Markdown."""
+    headings = algorithm.timed_phases
     return markdown(
         [
             {
@@ -420,7 +402,7 @@ def time_table(rows: list[dict[str, Any]]) -> str:
                 "L1": row["l1"],
                 "stage": row.get("stage", ""),
                 "runs": str(row["runs"]),
-                **{f"{w}, s": number(row[phase]) for phase, w in _PHASES.items() if phase in row},
+                **{f"{words}, s": number(row[phase]) for phase, words in headings.items()},
                 "training, ms per real step": number(row["ms_per_step"]),
                 "share of the training": f"{row['share']:.0%}" if "share" in row else "",
             }
