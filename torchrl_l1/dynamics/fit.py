@@ -203,6 +203,32 @@ def evaluate_members(
     return total / data.shape[0]
 
 
+def split_validation(
+    buffer: ReplayBuffer, purpose: str, items: str, setting: str
+) -> tuple[TensorDictBase, TensorDictBase]:
+    """What there is to train on, and what its flag ``validation`` ``(N,)`` keeps out of it.
+
+    Args:
+        buffer: the items.
+        purpose: what they are for, for the error.
+        items: what they are called there.
+        setting: the one that says how many are kept out.
+
+    Raises:
+        ValueError: if there is nothing to train or to validate on.
+    """
+    empty = TensorDict({"validation": torch.zeros(0, dtype=torch.bool)}, batch_size=[0])
+    data = buffer[:] if len(buffer) else empty
+    held_out = data["validation"].reshape(-1)
+    train, validation = data[~held_out], data[held_out]
+    if train.shape[0] == 0 or validation.shape[0] == 0:
+        raise ValueError(
+            f"cannot {purpose}: {train.shape[0]} training and {validation.shape[0]} validation "
+            f"{items}; collect more data or change {setting}"
+        )
+    return train, validation
+
+
 def fit_ensemble(
     dynamics: EnsembleDynamics,
     buffer: ReplayBuffer,
@@ -233,7 +259,10 @@ def fit_ensemble(
     """
     _check(config, dynamics)
     device = next(dynamics.parameters()).device
-    train, validation = (part.to(device) for part in _split(buffer, action_key))
+    train, validation = (
+        _transitions(part, action_key).to(device)
+        for part in split_validation(buffer, "fit", "transitions", "fit.validation_fraction")
+    )
     dynamics.train()
     change = train["next", "observation"] - train["observation"]
     dynamics.fit_statistics(train["observation"], train["action"], change)
@@ -327,9 +356,9 @@ def _decay(config: FitConfig, layers: int, size: int) -> list[float]:
     return [coefficient + hidden for coefficient in given[:-1]] + given[-1:]
 
 
-def _split(buffer: ReplayBuffer, action_key: str) -> tuple[TensorDict, TensorDict]:
-    data = buffer[:]
-    transitions = TensorDict(
+def _transitions(data: TensorDictBase, action_key: str) -> TensorDict:
+    """What :class:`EnsembleDynamicsLoss` reads, with the action that is the label."""
+    return TensorDict(
         {
             "observation": data["observation"],
             "action": data[action_key],
@@ -337,11 +366,3 @@ def _split(buffer: ReplayBuffer, action_key: str) -> tuple[TensorDict, TensorDic
         },
         batch_size=[data.shape[0]],
     )
-    held_out = data["validation"].reshape(-1)
-    train, validation = transitions[~held_out], transitions[held_out]
-    if train.shape[0] == 0 or validation.shape[0] == 0:
-        raise ValueError(
-            f"cannot fit: {train.shape[0]} training and {validation.shape[0]} validation "
-            "transitions; collect more data or change validation_fraction"
-        )
-    return train, validation
