@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from torchrl_l1.dynamics import EnsembleDynamics, Head, make_dynamics
+from torchrl_l1.dynamics.ensemble import ACTIVATIONS
 from torchrl_l1.dynamics.training_step import TrainingStep
 
 
@@ -47,7 +48,7 @@ def by_autograd(dynamics: EnsembleDynamics, inputs: Tensor, target: Tensor, deca
 
 
 @pytest.mark.parametrize("form", ["nonlinear", "affine"])
-@pytest.mark.parametrize("activation", ["relu", "tanh", "silu"])
+@pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
 @pytest.mark.parametrize("head", ["deterministic", "gaussian", "own"])
 def test_losses_and_gradients_are_those_of_autograd(head: str, activation: str, form: str) -> None:
     dynamics = model(form, AbsoluteError() if head == "own" else head, activation).double()

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, get_args
+from typing import Any, Protocol
 
 from torchrl_l1.dynamics import HEADS, MODEL_FORMS, EnsembleDynamics
-from torchrl_l1.dynamics.ensemble import ActivationName
+from torchrl_l1.dynamics.ensemble import ACTIVATIONS
 from torchrl_l1.envs import Task
 from torchrl_l1.planning import TrajectorySampler, check_sampling, resolve_compilation
 
@@ -133,7 +133,7 @@ class ModelConfig:
     def __post_init__(self) -> None:
         check_choice("model.form", self.form, MODEL_FORMS)
         check_choice("model.head", self.head, HEADS)
-        check_choice("model.activation", self.activation, get_args(ActivationName))
+        check_choice("model.activation", self.activation, tuple(ACTIVATIONS))
         if self.members < 1:
             raise ValueError(f"model.members must be at least 1, got {self.members}")
         check_widths("model.hidden", self.hidden)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from torchrl_l1.dynamics.ensemble import ActivationName, EnsembleMLP
+from torchrl_l1.dynamics.ensemble import EnsembleMLP
 from torchrl_l1.dynamics.model import EnsembleDynamics
 
 
@@ -34,9 +34,7 @@ class ControlAffineDynamics(EnsembleDynamics):
         True
     """
 
-    def _make_network(
-        self, hidden: Sequence[int], members: int, activation: ActivationName
-    ) -> EnsembleMLP:
+    def _make_network(self, hidden: Sequence[int], members: int, activation: str) -> EnsembleMLP:
         n, m = self.observation_dim, self.action_dim
         return EnsembleMLP(n, (1 + m) * self.head.out_features(n), hidden, members, activation)
 

@@ -12,20 +12,13 @@ from time import perf_counter
 from typing import Any, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from torchrl_l1.dynamics.ensemble import ACTIVATIONS
 from torchrl_l1.dynamics.heads import DeterministicHead
 from torchrl_l1.dynamics.model import EnsembleDynamics
 
 Precision = Literal["auto", "float32", "bfloat16"]
-
-# In place: at the sizes of planning a fresh tensor costs as much as the activation. With each,
-# what it maps to one, in bfloat16 too.
-_ACTIVATIONS: dict[str, tuple[Callable[[Tensor], Tensor], float]] = {
-    "relu": (torch.relu_, 1.0),
-    "tanh": (torch.tanh_, 20.0),
-    "silu": (lambda z: nn.functional.silu(z, inplace=True), 1.2784645),
-}
 
 # Widths of hidden layers are filled up to multiples of this.
 _ALIGNMENT = 16
@@ -146,8 +139,8 @@ class PlanningNetwork:
         weights = [weight[elites].double() for weight in dynamics.network.weights]
         biases = [bias[elites, 0].double() for bias in dynamics.network.biases]
         _fold_inputs(dynamics, weights, biases)
-        activation, one = _ACTIVATIONS[dynamics.network.activation]
-        _fold_biases(weights, biases, one)
+        activation = ACTIVATIONS[dynamics.network.activation]
+        _fold_biases(weights, biases, activation.one)
         # Between the layers of hidden units, and from the last to an output that is a small
         # correction of the state. That of a control-affine model may be a difference of large ones.
         last = len(weights) - 1
@@ -164,7 +157,7 @@ class PlanningNetwork:
             action_dim=dynamics.action_dim,
             change_mean=dynamics.change_normalizer.mean.to(torch.float32, copy=True),
             change_std=dynamics.change_normalizer.std.to(torch.float32, copy=True),
-            activation=activation,
+            activation=activation.in_place,
             standard_deviation=None if point else deepcopy(dynamics.head).standard_deviation,
         )
 

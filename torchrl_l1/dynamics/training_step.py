@@ -2,24 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Literal
 
 import torch
 from torch import Tensor
-from torch.nn.functional import silu
 
+from torchrl_l1.dynamics.ensemble import ACTIVATIONS
 from torchrl_l1.dynamics.model import EnsembleDynamics
-
-# Of each activation: it, and the gradient by what it was applied to, from the gradient by what
-# came of it, the former and the latter.
-_ACTIVATIONS: dict[
-    str, tuple[Callable[[Tensor], Tensor], Callable[[Tensor, Tensor, Tensor], Tensor]]
-] = {
-    "relu": (torch.relu, lambda g, z, units: torch.ops.aten.threshold_backward(g, units, 0)),
-    "tanh": (torch.tanh, lambda g, z, units: torch.ops.aten.tanh_backward(g, units)),
-    "silu": (silu, lambda g, z, units: torch.ops.aten.silu_backward(g, z)),
-}
 
 
 class TrainingStep:
@@ -53,7 +42,7 @@ class TrainingStep:
     ) -> None:
         network = dynamics.network
         self.dynamics, self.decay = dynamics, decay or []
-        self._apply, self._differentiate = _ACTIVATIONS[network.activation]
+        self._activation = ACTIVATIONS[network.activation]
         self._weights = [weight.detach() for weight in network.weights]
         self._biases = [bias.detach() for bias in network.biases]
         full = self._weights[0].dtype
@@ -84,7 +73,7 @@ class TrainingStep:
                 z = z.to(bias.dtype)
             sums.append(z.add_(bias.to(z.dtype)))
             if layer < last:
-                operands.append(self._apply(z).to(self._dtypes[layer + 1]))
+                operands.append(self._activation.value(z).to(self._dtypes[layer + 1]))
         losses, gradient = self._head(sums.pop(), inputs, target)
         for layer in range(last, -1, -1):
             by_weight = self._by_weights[layer]
@@ -97,7 +86,7 @@ class TrainingStep:
             if layer:
                 z, units = sums[layer - 1], operands.pop()
                 gradient = torch.bmm(gradient, weights[layer].mT).to(z.dtype)
-                gradient = self._differentiate(gradient, z, units.to(z.dtype))
+                gradient = self._activation.backward(gradient, z, units.to(z.dtype))
         for coefficient, by_weight, weight in zip(
             self.decay, self._by_weights, self._weights, strict=False
         ):
