@@ -155,24 +155,11 @@ class EnsembleDynamicsLoss(LossModule):
         model = self.dynamics
         inputs = model.normalize_inputs(observation, action)
         target = model.change_normalizer.normalize(next_observation - observation)
-        objective, per_member = self.objective(inputs, target)
+        per_member = model.head.loss(model.raw(inputs), target).mean(-1)
+        objective = per_member.sum() + model.head.penalty()
         return TensorDict(
             {"loss_dynamics": objective, "member_loss": per_member.detach()}, batch_size=[]
         )
-
-    def objective(self, inputs: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        """What :meth:`forward` gives, from normalised inputs and targets.
-
-        Args:
-            inputs: ``(B, n + m)``, or of each member's own batch ``(E, B, n + m)``.
-            target: ``(B, n)`` or ``(E, B, n)``.
-
-        Returns:
-            the objective and the members' losses ``(E,)``, not detached.
-        """
-        head = self.dynamics.head
-        per_member = head.loss(self.dynamics.raw(inputs), target).mean(-1)
-        return per_member.sum() + head.penalty(), per_member
 
 
 @dataclass

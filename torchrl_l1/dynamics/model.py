@@ -35,6 +35,9 @@ class EnsembleDynamics(nn.Module):
     Attributes:
         elites: indices of the members that the ensemble's mean is over, ascending, ``(k,)``; all
             of them until :meth:`set_elites`.
+        affine_in_action: whether members give the coefficients of a function that is affine in
+            the action, which their networks then do not read: a :class:`ControlAffineDynamics`.
+            Planning networks and fits go by it.
 
     Examples:
         >>> import torch
@@ -45,6 +48,7 @@ class EnsembleDynamics(nn.Module):
     """
 
     elites: Tensor
+    affine_in_action: bool = False
 
     def __init__(
         self,

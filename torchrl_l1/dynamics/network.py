@@ -14,6 +14,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from torchrl_l1.dynamics.control_affine import affine_coefficients, affine_output
 from torchrl_l1.dynamics.ensemble import ACTIVATIONS
 from torchrl_l1.dynamics.heads import DeterministicHead
 from torchrl_l1.dynamics.model import EnsembleDynamics
@@ -104,6 +105,7 @@ class PlanningNetwork:
         activation: activation of the hidden layers, in place.
         standard_deviation: maps a member's raw output to the standard deviation of its
             prediction, normalised units; ``None`` if it predicts points.
+        affine_in_action: as of the ensemble.
 
     Examples:
         >>> model = EnsembleDynamics(3, 1, members=2, hidden=(8, 8))
@@ -122,6 +124,7 @@ class PlanningNetwork:
     change_std: Tensor
     activation: Callable[[Tensor], Tensor]
     standard_deviation: Callable[[Tensor], Tensor] | None = None
+    affine_in_action: bool = False
 
     @classmethod
     @torch.no_grad()
@@ -144,8 +147,8 @@ class PlanningNetwork:
         # Between the layers of hidden units, and from the last to an output that is a small
         # correction of the state. That of a control-affine model may be a difference of large ones.
         last = len(weights) - 1
-        affine = dynamics.network.weights[0].shape[1] == dynamics.observation_dim
-        low = range(1, last if affine else last + 1) if last > 1 else range(0)
+        end = last if dynamics.affine_in_action else last + 1
+        low = range(1, end) if last > 1 else range(0)
         point = isinstance(dynamics.head, DeterministicHead)
         return cls(
             weights=[
@@ -159,6 +162,7 @@ class PlanningNetwork:
             change_std=dynamics.change_normalizer.std.to(torch.float32, copy=True),
             activation=activation.in_place,
             standard_deviation=None if point else deepcopy(dynamics.head).standard_deviation,
+            affine_in_action=dynamics.affine_in_action,
         )
 
     @property
@@ -240,22 +244,10 @@ class ForwardPass:
                     operand.copy_(units)
                 torch.mm(operand, weight, out=out)
         raw = self._out.float()
-        if self._width == inputs.shape[1]:
+        if not self._network.affine_in_action:
             return raw
-        return affine_output(raw, inputs[:, self._width :].repeat(self._copies, 1))
-
-
-def affine_output(raw: Tensor, action: Tensor) -> Tensor:
-    """Raw output of a control-affine model, whose network gives offset and gain.
-
-    Args:
-        raw: the network's output ``(..., (1 + m) out)``, or what is returned if m is zero.
-        action: what the network has not seen, ``(..., m)``.
-    """
-    if action.shape[-1] == 0:
-        return raw
-    parts = raw.unflatten(-1, (1 + action.shape[-1], -1))
-    return parts[..., 0, :] + (parts[..., 1:, :] * action[..., None]).sum(-2)
+        action = inputs[:, self._width :].repeat(self._copies, 1)
+        return affine_output(*affine_coefficients(raw, self._network.action_dim), action)
 
 
 _Layer = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -301,13 +293,13 @@ def _fold_inputs(dynamics: EnsembleDynamics, weights: list[Tensor], biases: list
     width = weights[0].shape[1]
     weights[0] = weights[0] / std[:width, None]
     biases[0] = biases[0] - mean[:width] @ weights[0]
-    if width == mean.shape[0]:
+    if not dynamics.affine_in_action:
         return
     for layers in (weights, biases):
-        rows = layers[-1].unflatten(-1, (1 + dynamics.action_dim, -1))
-        gain = rows[..., 1:, :] / action.std.double()[:, None]
-        offset = rows[..., :1, :] - (action.mean.double()[:, None] * gain).sum(-2, keepdim=True)
-        layers[-1] = torch.cat([offset, gain], -2).flatten(-2)
+        offset, gain = affine_coefficients(layers[-1], dynamics.action_dim)
+        gain = gain / action.std.double()[:, None]
+        offset = affine_output(offset, gain, -action.mean.double())
+        layers[-1] = torch.cat([offset[..., None, :], gain], -2).flatten(-2)
 
 
 def _fold_biases(weights: list[Tensor], biases: list[Tensor], one: float) -> None:

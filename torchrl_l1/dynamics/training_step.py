@@ -14,6 +14,8 @@ from torchrl_l1.dynamics.model import EnsembleDynamics
 class TrainingStep:
     """Losses of all members on a batch, and the gradients of what a fit minimises.
 
+    The objective is that of :class:`~torchrl_l1.dynamics.EnsembleDynamicsLoss`, computed faster,
+    and the decay: see ``test_the_objective_is_that_of_the_loss`` in ``test_training_step.py``.
     The network's derivatives are written out here, those of the head are its own business. In
     ``bfloat16`` the products between hidden layers and from the last one, forward and back, and
     what is between them are of that precision; parameters, gradients, sums over a batch, the
@@ -95,13 +97,14 @@ class TrainingStep:
 
     def _head(self, output: Tensor, inputs: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         """The members' losses and the gradient by the network's output ``(E, B, out)``."""
-        head = self.dynamics.head
+        dynamics = self.dynamics
+        if not dynamics.affine_in_action:
+            return dynamics.head.loss_and_gradient(output, target)
         with torch.enable_grad():
-            leaf = output.requires_grad_()
-            raw = self.dynamics.raw_from_output(leaf, inputs)
-        losses, gradient = head.loss_and_gradient(raw.detach(), target)
-        if raw is not leaf:
-            (gradient,) = torch.autograd.grad(raw, leaf, gradient)
+            output.requires_grad_()
+            raw = dynamics.raw_from_output(output, inputs)
+        losses, by_raw = dynamics.head.loss_and_gradient(raw.detach(), target)
+        (gradient,) = torch.autograd.grad(raw, output, by_raw)
         return losses, gradient
 
 

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from torchrl_l1.compilation import CompileMode, compiled
-from torchrl_l1.dynamics.network import PlanningNetwork, affine_output
+from torchrl_l1.dynamics.control_affine import affine_coefficients, affine_output
+from torchrl_l1.dynamics.network import PlanningNetwork
 from torchrl_l1.planning.particles import Draws, Predict, Propagation
 
 _Group = tuple[int, int, int]
@@ -141,7 +142,10 @@ def _raw(network: PlanningNetwork, first: int, last: int, inputs: Tensor) -> Ten
     units = torch.baddbmm(network.bias[first:last, None], inputs[..., :width], weight[first:last])
     for weight in following:
         units = torch.bmm(network.activation(units).to(weight.dtype), weight[first:last])
-    return affine_output(units.float(), inputs[..., width:])
+    raw = units.float()
+    if not network.affine_in_action:
+        return raw
+    return affine_output(*affine_coefficients(raw, network.action_dim), inputs[..., width:])
 
 
 def _has_compiler() -> bool:
