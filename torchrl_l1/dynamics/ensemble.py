@@ -10,6 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torchrl_l1.checks import check_choice
+
 
 def _relu(z: Tensor) -> tuple[Tensor, Tensor]:
     value = z.relu()
@@ -101,8 +103,7 @@ class EnsembleMLP(nn.Module):
         activation: str = "relu",
     ) -> None:
         super().__init__()
-        if activation not in ACTIVATIONS:
-            raise ValueError(f"activation must be one of {sorted(ACTIVATIONS)}, got {activation!r}")
+        check_choice("activation", activation, tuple(ACTIVATIONS))
         widths = [in_features, *hidden, out_features]
         if members < 1 or min(widths) < 1:
             raise ValueError(f"members and widths must be positive, got {members} and {widths}")

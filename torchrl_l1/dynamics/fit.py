@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -13,6 +12,13 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.objectives.common import LossModule
 
+from torchrl_l1.checks import (
+    check_counts,
+    check_not_negative,
+    check_optional_count,
+    check_positive,
+    check_within,
+)
 from torchrl_l1.dynamics.model import EnsembleDynamics
 from torchrl_l1.dynamics.network import model_precision, resolve_precision
 from torchrl_l1.dynamics.training_step import TrainingStep
@@ -61,27 +67,16 @@ class FitConfig:
     precision: str = "float32"
 
     def __post_init__(self) -> None:
-        for name in ("batch_size", "max_epochs", "max_gradient_steps", "patience"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"fit.{name} must be at least 1, got {getattr(self, name)}")
-        if not 0 < self.validation_fraction < 1:
-            raise ValueError(
-                f"fit.validation_fraction must be between 0 and 1, got {self.validation_fraction}"
-            )
-        if self.learning_rate <= 0:
-            raise ValueError(f"fit.learning_rate must be positive, got {self.learning_rate}")
-        if not 0 < self.final_learning_rate_fraction <= 1:
-            raise ValueError(
-                "fit.final_learning_rate_fraction must be positive and at most 1, got "
-                f"{self.final_learning_rate_fraction}"
-            )
-        if not all(0 <= coefficient < math.inf for coefficient in self.weight_decay):
-            raise ValueError(
-                "fit.weight_decay must hold finite coefficients, none negative, got "
-                f"{list(self.weight_decay)}"
-            )
-        if self.elites is not None and self.elites < 1:
-            raise ValueError(f"fit.elites must be at least 1 or null, got {self.elites}")
+        counts = ("batch_size", "max_epochs", "max_gradient_steps", "patience")
+        check_counts(self, *counts, prefix="fit.")
+        check_within("fit.validation_fraction", self.validation_fraction, "(0, 1)")
+        check_positive("fit.learning_rate", self.learning_rate)
+        fraction = self.final_learning_rate_fraction
+        check_within("fit.final_learning_rate_fraction", fraction, "(0, 1]")
+        check_not_negative("fit.weight_penalty", self.weight_penalty)
+        for layer, coefficient in enumerate(self.weight_decay):
+            check_not_negative(f"fit.weight_decay[{layer}]", coefficient)
+        check_optional_count("fit.elites", self.elites)
         resolve_precision(self.precision, name="fit.precision")
 
 
