@@ -14,6 +14,21 @@ import torch
 CompileMode = bool | Literal["auto"]
 
 
+def check_mode(mode: object, name: str = "compile") -> CompileMode:
+    """The mode itself, refused if it is none.
+
+    Args:
+        mode: what a setting says.
+        name: of the setting, for the error.
+
+    Raises:
+        ValueError: if it is neither a truth value nor ``"auto"``; 0 and 1 are numbers.
+    """
+    if isinstance(mode, bool) or mode == "auto":
+        return mode
+    raise ValueError(f"{name} must be True, False or 'auto', got {mode!r}")
+
+
 def compiled(
     function: FunctionType, mode: CompileMode, *, dynamic: bool | None, notice: str = ""
 ) -> Callable[..., Any]:
@@ -31,11 +46,9 @@ def compiled(
     Raises:
         ValueError: for any other mode.
     """
-    if mode is False:
+    if check_mode(mode) is False:
         return function
-    if mode is True or mode == "auto":
-        return _Compiled(function, mode == "auto", dynamic, notice)
-    raise ValueError(f"compile must be True, False or 'auto', got {mode!r}")
+    return _Compiled(function, mode == "auto", dynamic, notice)
 
 
 class _Compiled:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import torch
 
-from torchrl_l1.algorithms.seeding import seed_streams, stream_seed
+from torchrl_l1.algorithms.collection import seed_streams, stream_seed
 
 
 def test_streams_are_reproducible_and_distinct() -> None:

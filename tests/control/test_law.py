@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchrl_l1.control import L1Config, L1State, init, step
-from torchrl_l1.control.law import project, saturate
+from torchrl_l1.control.law import project, respond, saturate
 
 
 def well_conditioned(rng: np.random.Generator, *shape: int) -> np.ndarray:
@@ -316,3 +316,6 @@ def test_shapes_that_do_not_fit_are_named():
     for name, value in bad.items():
         with pytest.raises(ValueError, match=f"^{name} has shape"):
             step(config, state, **(good | {name: value}))
+    good["change"], good["u_bar"] = good.pop("drift"), torch.zeros(3, 2)
+    with pytest.raises(ValueError, match=r"^change has shape"):
+        respond(config, state, **(good | {"change": bad["drift"]}))

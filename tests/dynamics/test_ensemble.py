@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from torch import nn
 
 from torchrl_l1.dynamics import EnsembleDynamics, EnsembleMLP
+from torchrl_l1.dynamics.ensemble import ACTIVATIONS
 
-ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
+LAYERS = {"relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
 
 
 def as_sequential(ensemble: EnsembleMLP, member: int) -> nn.Sequential:
@@ -18,11 +19,11 @@ def as_sequential(ensemble: EnsembleMLP, member: int) -> nn.Sequential:
         linear = nn.Linear(weight.shape[1], weight.shape[2])
         linear.weight.data = weight[member].T.detach().clone()
         linear.bias.data = bias[member, 0].detach().clone()
-        layers += [linear, ACTIVATIONS[ensemble.activation]()]
+        layers += [linear, LAYERS[ensemble.activation]()]
     return nn.Sequential(*layers[:-1])
 
 
-@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("activation", LAYERS)
 def test_members_agree_with_torch_layers(activation: str) -> None:
     torch.manual_seed(0)
     ensemble = EnsembleMLP(4, 3, (8, 6), members=3, activation=activation)
@@ -110,3 +111,23 @@ def test_wrong_settings_and_shapes_are_named() -> None:
     model = EnsembleDynamics(3, 2, members=2, hidden=(4,))
     with pytest.raises(ValueError, match="actions of width 2, got 3 and 1"):
         model.mean_change(torch.zeros(1, 3), torch.zeros(1, 1))
+
+
+@pytest.mark.parametrize("name", sorted(ACTIVATIONS))
+def test_all_that_is_computed_with_an_activation_is_that_activation(name: str) -> None:
+    activation = ACTIVATIONS[name]
+    z = torch.linspace(-4, 4, 90, dtype=torch.float64, requires_grad=True)
+    expected, gradient = LAYERS[name]()(z), torch.linspace(1, 2, 90, dtype=torch.float64)
+    (by_z,) = torch.autograd.grad(expected, z, gradient)
+    x = z.detach()
+    torch.testing.assert_close(activation.value(x), expected.detach())
+    value, derivative = activation.value_and_derivative(x)
+    torch.testing.assert_close(value, expected.detach())
+    torch.testing.assert_close(derivative * gradient, by_z)
+    torch.testing.assert_close(activation.backward(gradient, x, value), by_z)
+    written = x.clone()
+    assert activation.in_place(written) is written
+    torch.testing.assert_close(written, value)
+    for dtype in (torch.float32, torch.bfloat16):
+        one = torch.full((1,), activation.one, dtype=dtype)
+        assert activation.value(one).item() == pytest.approx(1, abs=1e-7)

@@ -135,7 +135,7 @@ def test_another_head_sets_width_and_loss() -> None:
 
 @pytest.mark.parametrize("fraction", [0.0, 1.5])
 def test_the_learning_rate_never_rises(fraction: float) -> None:
-    with pytest.raises(ValueError, match="final_learning_rate_fraction must be positive and at"):
+    with pytest.raises(ValueError, match=r"final_learning_rate_fraction must be in \(0, 1\]"):
         FitConfig(final_learning_rate_fraction=fraction)
 
 
@@ -292,8 +292,8 @@ def test_settings_that_do_not_fit_the_model_leave_it_alone(
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"weight_decay": [0.1, -1.0]}, "fit.weight_decay must hold finite"),
-        ({"weight_decay": [float("nan")]}, "fit.weight_decay must hold finite"),
+        ({"weight_decay": [0.1, -1.0]}, r"fit.weight_decay\[1\] must be finite and not negative"),
+        ({"weight_decay": [float("nan")]}, r"fit.weight_decay\[0\] must be finite"),
         ({"elites": 0}, "fit.elites must be at least 1"),
     ],
 )

@@ -207,16 +207,16 @@ def test_starts_within_the_bounds():
     ("wrong", "message"),
     [
         ({"candidates": 10, "elites": 11}, r"elites \(11\) must not exceed .*candidates \(10\)"),
-        ({"horizon": 0}, r"horizon must be in \[1, inf\], got 0"),
+        ({"horizon": 0}, "cem.horizon must be at least 1, got 0"),
         ({"candidates": 0}, "candidates must be"),
         ({"elites": 0}, "elites must be"),
         ({"iterations": 0}, "iterations must be"),
         ({"momentum": -0.1}, "momentum must be"),
-        ({"momentum": 1.0}, "momentum must be below 1"),
+        ({"momentum": 1.0}, r"momentum must be in \[0, 1\), got 1.0"),
         ({"momentum": math.nan}, "momentum must be"),
         ({"minimum_variance": -1.0}, "minimum_variance must be"),
-        ({"initial_variance": 0.0}, "initial_variance must be positive"),
-        ({"initial_variance": math.inf}, "initial_variance must be positive"),
+        ({"initial_variance": 0.0}, "initial_variance must be finite and positive"),
+        ({"initial_variance": math.inf}, "initial_variance must be finite"),
     ],
 )
 def test_impossible_settings_are_named(wrong, message):

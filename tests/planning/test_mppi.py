@@ -59,11 +59,11 @@ def test_returns_that_are_not_finite_weigh_nothing(value):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"horizon": 0}, "MPPIConfig.horizon must be"),
-        ({"iterations": 0}, "MPPIConfig.iterations must be"),
-        ({"candidates": 0}, "MPPIConfig.candidates must be"),
-        ({"temperature": 0.0}, "MPPIConfig.temperature must be positive"),
-        ({"variance": math.nan}, "MPPIConfig.variance must be positive"),
+        ({"horizon": 0}, "mppi.horizon must be"),
+        ({"iterations": 0}, "mppi.iterations must be"),
+        ({"candidates": 0}, "mppi.candidates must be"),
+        ({"temperature": 0.0}, "mppi.temperature must be finite and positive"),
+        ({"variance": math.nan}, "mppi.variance must be finite"),
     ],
 )
 def test_impossible_settings_are_named(wrong, message):

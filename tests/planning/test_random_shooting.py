@@ -150,5 +150,5 @@ def test_best_of_a_quadratic_is_distributed_as_it_must_be(horizon, share):
 
 
 def test_impossible_settings_are_named():
-    with pytest.raises(ValueError, match=r"ShootingConfig.candidates must be in \[1, inf\], got 0"):
+    with pytest.raises(ValueError, match=r"shooting.candidates must be at least 1, got 0"):
         ShootingConfig(candidates=0)

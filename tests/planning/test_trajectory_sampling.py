@@ -338,17 +338,17 @@ def test_bad_input_is_named():
     check(r"actions must have shape \(2, candidates, horizon, 2\)", actions=actions[..., :1])
     check(r"actions must have shape \(2, ", actions=actions[:1])
     check("nothing to evaluate", actions=actions[:, :0])
-    check(r"propagation must be one of .* got 'ts2'", propagation="ts2")
+    check(r"propagation must be .* got 'ts2'", propagation="ts2")
     check("precision must be", precision="half")
-    check("particles and block must be positive", particles=0)
-    check("particles and block must be positive", block=0)
+    check("particles must be at least 1", particles=0)
+    check("block must be at least 1 or null", block=0)
     for discount in (0.0, 1.01, math.nan):
         check(rf"discount must be in \(0, 1\], got {discount}", discount=discount)
     check("compile must be True, False or 'auto', got 'yes'", compile="yes")
     check("the reward function must return", reward=lambda x, u, s: s[..., :1])
     check("the terminated function must return", terminated=lambda s: s[..., :1] > 0)
     for wrong, message in (
-        ({"particles": 0}, "must be positive"),
+        ({"particles": 0}, "particles must be at least 1"),
         ({"propagation": "all"}, "propagation must be"),
         ({"precision": "double"}, "precision must be"),
         ({"discount": 0}, "discount must be"),

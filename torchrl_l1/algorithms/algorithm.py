@@ -14,11 +14,10 @@ from typing import Any, ClassVar, Protocol, TypedDict
 import torch
 from tensordict.nn import TensorDictModuleBase
 
-from torchrl_l1.algorithms.collection import RETURN_METRICS, Collection
+from torchrl_l1.algorithms.collection import RETURN_METRICS, Collection, seed_streams
 from torchrl_l1.algorithms.config import ModelConfig, episode_length
 from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.algorithms.model_learning import FIT_METRICS, ModelLearning, fit_metrics
-from torchrl_l1.algorithms.seeding import seed_streams
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import FitConfig, make_dynamics

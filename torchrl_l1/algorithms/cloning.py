@@ -10,10 +10,11 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from torchrl_l1.algorithms.mbmf_config import CloningConfig
+from torchrl_l1.algorithms.model_learning import TrainingData
 from torchrl_l1.algorithms.policy import GaussianPolicy
+from torchrl_l1.dynamics.fit import split_validation
 
 CLONING_METRICS: dict[str, str] = {
     "clone/train_loss": "Stage 2: mean squared difference between the policy's and the planner's "
@@ -68,9 +69,8 @@ class Cloning:
         self, policy: GaussianPolicy, config: CloningConfig, half_range: float, capacity: int
     ) -> None:
         self.policy, self.config, self.half_range = policy, config, half_range
-        self.buffer = ReplayBuffer(
-            storage=LazyTensorStorage(capacity), batch_size=config.batch_size
-        )
+        self.data = TrainingData(capacity, config.batch_size, config.validation_fraction)
+        self.buffer = self.data.buffer
 
     def store(self, observation: Tensor, action: Tensor) -> None:
         """Add states ``(B, n)`` with the expert's actions ``(B, m)``, where both are finite.
@@ -78,13 +78,12 @@ class Cloning:
         A fixed share of them is kept out of training for good.
         """
         finite = torch.isfinite(observation).all(-1) & torch.isfinite(action).all(-1)
-        items = TensorDict(
-            {"observation": observation[finite], "action": action[finite]},
-            batch_size=[int(finite.sum())],
+        self.data.extend(
+            TensorDict(
+                {"observation": observation[finite], "action": action[finite]},
+                batch_size=[int(finite.sum())],
+            )
         )
-        items["validation"] = torch.rand(items.shape[0]) < self.config.validation_fraction
-        if items.shape[0]:
-            self.buffer.extend(items)
 
     def fit(self, on_epoch: Callable[[int], None] | None = None) -> CloningReport:
         """Fit the policy to all pairs so far, from the weights that it has.
@@ -95,7 +94,13 @@ class Cloning:
             ValueError: if there is nothing to train or to validate on.
         """
         config, policy = self.config, self.policy
-        train, validation = self._split(next(policy.parameters()).device)
+        device = next(policy.parameters()).device
+        train, validation = (
+            part.to(device)
+            for part in split_validation(
+                self.buffer, "clone", "states", "cloning.validation_fraction"
+            )
+        )
         policy.normalizer.fit(train["observation"])
         optimizer = torch.optim.Adam(policy.mean.parameters(), lr=config.learning_rate, fused=True)
         best, best_loss, stale = deepcopy(policy.mean.state_dict()), torch.inf, 0
@@ -126,23 +131,10 @@ class Cloning:
         mean, _ = self.policy(data["observation"])
         return ((mean - data["action"]) / self.half_range).square().mean()
 
-    def _split(self, device: torch.device) -> tuple[TensorDict, TensorDict]:
-        data = self.buffer[:].to(device) if len(self.buffer) else TensorDict(batch_size=[0])
-        held_out = data["validation"].reshape(-1) if len(self.buffer) else torch.zeros(0).bool()
-        train, validation = data[~held_out], data[held_out]
-        if train.shape[0] == 0 or validation.shape[0] == 0:
-            raise ValueError(
-                f"cannot clone: {train.shape[0]} training and {validation.shape[0]} validation "
-                "states; collect more of them or change cloning.validation_fraction"
-            )
-        return train, validation
-
     def state_dict(self) -> dict[str, Any]:
         """The pairs so far, as plain tensors."""
-        return {"pairs": self.buffer[:].to_dict() if len(self.buffer) else {}}
+        return {"pairs": self.data.state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`; other entries of ``state`` do not matter."""
-        self.buffer.empty()
-        if state["pairs"]:
-            self.buffer.extend(TensorDict(state["pairs"]).auto_batch_size_(1))
+        self.data.load(state["pairs"])

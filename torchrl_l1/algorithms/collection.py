@@ -1,7 +1,8 @@
-"""Real data: the environment with its perturbations, with L1 on or off, behind a collector."""
+"""Real data: the environment with its perturbations, with L1 or without, and random streams."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 
@@ -14,7 +15,6 @@ from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase, RewardSum, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_type
 
-from torchrl_l1.algorithms.seeding import seed_streams, stream_seed
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.dynamics import EnsembleDynamics
@@ -251,6 +251,24 @@ def first_episodes(data: TensorDictBase) -> TensorDictBase:
     """The steps of the first episode of every environment in ``[N, T]``, in one row."""
     done = data["next", "done"].squeeze(-1)
     return data[done.cumsum(1) - done.long() == 0]
+
+
+def stream_seed(seed: int, *names: str | int) -> int:
+    """A 63-bit seed for the stream of that name.
+
+    Examples:
+        >>> stream_seed(0, "iteration", 3) == stream_seed(0, "iteration", 3)
+        True
+        >>> stream_seed(0, "iteration", 3) == stream_seed(0, "iteration", 4)
+        False
+    """
+    digest = hashlib.sha256(repr((seed, *names)).encode()).digest()
+    return int.from_bytes(digest[:8], "big") >> 1
+
+
+def seed_streams(seed: int, *names: str | int) -> None:
+    """Start torch's global generator on the stream of that name."""
+    torch.manual_seed(stream_seed(seed, *names))
 
 
 def _with_executed(data: TensorDictBase) -> TensorDictBase:

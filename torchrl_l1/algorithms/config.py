@@ -1,14 +1,19 @@
-"""Settings that algorithms share, and their checks."""
+"""Settings that algorithms share."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, get_args
+from typing import Any, Protocol
 
+from torchrl_l1.checks import (
+    check_choice,
+    check_counts,
+    check_not_negative,
+    check_positive,
+    check_widths,
+)
 from torchrl_l1.dynamics import HEADS, MODEL_FORMS, EnsembleDynamics
-from torchrl_l1.dynamics.ensemble import ActivationName
+from torchrl_l1.dynamics.ensemble import ACTIVATIONS
 from torchrl_l1.envs import Task
 from torchrl_l1.planning import TrajectorySampler, check_sampling, resolve_compilation
 
@@ -75,37 +80,6 @@ def episode_length(asked: int | None, horizon: int) -> int:
     return min(asked or horizon, horizon)
 
 
-def check_counts(settings: object, *names: str, prefix: str = "") -> None:
-    """Refuse counts below one, with a ``ValueError``."""
-    for name in names:
-        if getattr(settings, name) < 1:
-            raise ValueError(f"{prefix}{name} must be at least 1, got {getattr(settings, name)}")
-
-
-def check_steps(name: str, value: int | None) -> None:
-    """Refuse a number of steps that is neither null nor at least one, with a ``ValueError``."""
-    if value is not None and value < 1:
-        raise ValueError(f"{name} must be at least 1 or null, got {value}")
-
-
-def check_choice(name: str, value: str, allowed: Sequence[str]) -> None:
-    """Refuse a value that is none of those allowed, with a ``ValueError``."""
-    if value not in allowed:
-        raise ValueError(f"{name} must be {' or '.join(map(repr, allowed))}, got {value!r}")
-
-
-def check_positive(name: str, value: float) -> None:
-    """Refuse a value that is not finite and positive, with a ``ValueError``."""
-    if not (value > 0 and math.isfinite(value)):
-        raise ValueError(f"{name} must be finite and positive, got {value}")
-
-
-def check_widths(name: str, widths: Sequence[int]) -> None:
-    """Refuse widths below one, with a ``ValueError``."""
-    if any(width < 1 for width in widths):
-        raise ValueError(f"{name} must hold widths of at least 1, got {list(widths)}")
-
-
 @dataclass
 class ModelConfig:
     """The ensemble, see :func:`~torchrl_l1.dynamics.make_dynamics`.
@@ -133,12 +107,8 @@ class ModelConfig:
     def __post_init__(self) -> None:
         check_choice("model.form", self.form, MODEL_FORMS)
         check_choice("model.head", self.head, HEADS)
-        check_choice("model.activation", self.activation, get_args(ActivationName))
-        if self.members < 1:
-            raise ValueError(f"model.members must be at least 1, got {self.members}")
+        check_choice("model.activation", self.activation, tuple(ACTIVATIONS))
+        check_counts(self, "members", prefix="model.")
         check_widths("model.hidden", self.hidden)
         check_positive("model.std_floor", self.std_floor)
-        if not (self.box_margin >= 0 and math.isfinite(self.box_margin)):
-            raise ValueError(
-                f"model.box_margin must be finite and not negative, got {self.box_margin}"
-            )
+        check_not_negative("model.box_margin", self.box_margin)

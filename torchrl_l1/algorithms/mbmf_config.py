@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
-from torchrl_l1.algorithms.config import (
-    ModelConfig,
+from torchrl_l1.algorithms.config import ModelConfig, check_plans
+from torchrl_l1.algorithms.facts import Stage
+from torchrl_l1.checks import (
     check_choice,
     check_counts,
-    check_plans,
+    check_not_negative,
+    check_optional_count,
     check_positive,
-    check_steps,
     check_widths,
+    check_within,
 )
-from torchrl_l1.algorithms.facts import Stage
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.planning import ShootingConfig
 
@@ -78,11 +78,7 @@ class CloningConfig:
         check_positive("cloning.std", self.std)
         check_positive("cloning.learning_rate", self.learning_rate)
         check_choice("cloning.label_states", self.label_states, ("current", "initial"))
-        if not 0 < self.validation_fraction < 1:
-            raise ValueError(
-                "cloning.validation_fraction must be between 0 and 1, got "
-                f"{self.validation_fraction}"
-            )
+        check_within("cloning.validation_fraction", self.validation_fraction, "(0, 1)")
 
 
 @dataclass
@@ -129,19 +125,11 @@ class FineTuningConfig:
         check_widths("fine_tuning.value_hidden", self.value_hidden)
         for name in ("std", "learning_rate", "value_learning_rate", "max_gradient_norm"):
             check_positive(f"fine_tuning.{name}", getattr(self, name))
-        if not 0 < self.clip_epsilon < 1:
-            raise ValueError(
-                f"fine_tuning.clip_epsilon must be between 0 and 1, got {self.clip_epsilon}"
-            )
-        check_steps("fine_tuning.anneal_steps", self.anneal_steps)
-        if not 0 <= self.entropy_coefficient < math.inf:
-            raise ValueError(
-                "fine_tuning.entropy_coefficient must be finite and not negative, got "
-                f"{self.entropy_coefficient}"
-            )
+        check_within("fine_tuning.clip_epsilon", self.clip_epsilon, "(0, 1)")
+        check_optional_count("fine_tuning.anneal_steps", self.anneal_steps)
+        check_not_negative("fine_tuning.entropy_coefficient", self.entropy_coefficient)
         for name in ("discount", "gae_lambda"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"fine_tuning.{name} must be in [0, 1], got {getattr(self, name)}")
+            check_within(f"fine_tuning.{name}", getattr(self, name), "[0, 1]")
 
 
 @dataclass
@@ -217,10 +205,9 @@ class MBMFConfig:
             "shooting_episodes",
             "evaluation_episodes",
         )
-        check_steps("episode_steps", self.episode_steps)
-        check_steps("random_steps", self.random_steps)
-        if not 0 < self.plan_discount <= 1:
-            raise ValueError(f"plan_discount must be in (0, 1], got {self.plan_discount}")
+        check_optional_count("episode_steps", self.episode_steps)
+        check_optional_count("random_steps", self.random_steps)
+        check_within("plan_discount", self.plan_discount, "(0, 1]")
         if self.action_bound is not None:
             check_positive("action_bound", self.action_bound)
         check_plans(self, "shooting", self.shooting.horizon)

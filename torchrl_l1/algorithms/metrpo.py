@@ -167,4 +167,5 @@ class METRPO(Algorithm):
         """Continue from :meth:`state_dict`."""
         super().load_state_dict(state)
         self.policy.load_state_dict(state["policy"])
+        self.acting_policy.load_state_dict(state["policy"])
         self.improvement.load_state_dict(state["improvement"])

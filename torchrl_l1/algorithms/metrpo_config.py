@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from torchrl_l1.algorithms.config import (
-    ModelConfig,
+from torchrl_l1.algorithms.config import ModelConfig
+from torchrl_l1.checks import (
     check_choice,
     check_counts,
+    check_optional_count,
     check_positive,
-    check_steps,
     check_widths,
+    check_within,
 )
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.objectives import TRPOConfig
@@ -108,17 +109,16 @@ class METRPOConfig:
         resolve_precision(self.precision)
         check_choice("label", self.label, ("nominal", "executed"))
         check_choice("box_exit", self.box_exit, ("truncate", "fail"))
-        check_steps("episode_steps", self.episode_steps)
+        check_optional_count("episode_steps", self.episode_steps)
         counts = ("outer_iterations", "episodes_per_iteration", "evaluation_episodes")
         check_counts(self, *counts, "trpo_iterations", "imagined_horizon")
-        if self.imagined_steps < self.imagined_horizon:
+        if not self.imagined_steps >= self.imagined_horizon:
             raise ValueError(
                 f"imagined_steps ({self.imagined_steps}) must hold at least one trajectory of "
                 f"imagined_horizon ({self.imagined_horizon}) steps"
             )
         for name in ("imagined_from_data", "discount", "gae_lambda"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
+            check_within(name, getattr(self, name), "[0, 1]")
 
     def collected_episodes(self, iterations: int) -> int:
         """Real episodes of so many outer iterations; random data do not count."""

@@ -1,4 +1,4 @@
-"""What every algorithm around a learned model keeps: the model, its optimizer and its data."""
+"""What algorithms around a learned model keep: their data, the model and its optimizer."""
 
 from __future__ import annotations
 
@@ -20,6 +20,41 @@ FIT_METRICS: dict[str, str] = {
 """What a fit of the model reports."""
 
 
+class TrainingData:
+    """All that has been seen so far, a fixed share of it kept out of training for good.
+
+    :func:`~torchrl_l1.dynamics.fit.split_validation` tells the two parts apart.
+
+    Args:
+        capacity: items that there is room for.
+        batch_size: items that the buffer samples at once.
+        validation_fraction: the share kept out.
+
+    Attributes:
+        buffer: the items, with the flag ``validation``.
+    """
+
+    def __init__(self, capacity: int, batch_size: int, validation_fraction: float) -> None:
+        self.validation_fraction = validation_fraction
+        self.buffer = ReplayBuffer(storage=LazyTensorStorage(capacity), batch_size=batch_size)
+
+    def extend(self, items: TensorDictBase) -> None:
+        """Add items ``[N]``, drawing for each whether it is kept out."""
+        items["validation"] = torch.rand(items.shape[0]) < self.validation_fraction
+        if items.shape[0]:
+            self.buffer.extend(items)
+
+    def state(self) -> dict[str, Any]:
+        """The items, as plain tensors."""
+        return self.buffer[:].to_dict() if len(self.buffer) else {}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Continue from :meth:`state`."""
+        self.buffer.empty()
+        if state:
+            self.buffer.extend(TensorDict(state).auto_batch_size_(1))
+
+
 class ModelLearning:
     """A model, the real transitions seen so far, and the fits of one to the other.
 
@@ -39,19 +74,18 @@ class ModelLearning:
         self.optimizer = torch.optim.Adam(
             dynamics.parameters(), lr=config.learning_rate, fused=True
         )
-        self.buffer = ReplayBuffer(
-            storage=LazyTensorStorage(capacity), batch_size=config.batch_size
-        )
+        self.data = TrainingData(capacity, config.batch_size, config.validation_fraction)
+        self.buffer = self.data.buffer
 
     def store(self, data: TensorDictBase) -> None:
         """Add real transitions ``[N, T]``, a fixed share of them marked for validation."""
         flat = data.reshape(-1)
         flat = flat[~flat["next", "non_finite"].squeeze(-1)]
-        items = flat.select(
-            "observation", "action", "executed", ("next", "observation"), ("next", "reward")
+        self.data.extend(
+            flat.select(
+                "observation", "action", "executed", ("next", "observation"), ("next", "reward")
+            )
         )
-        items["validation"] = torch.rand(items.shape[0]) < self.config.validation_fraction
-        self.buffer.extend(items)
 
     def fit(self, on_epoch: Callable[[int], None] | None = None) -> FitReport:
         """Fit the model to all data, from the weights that it has."""
@@ -69,16 +103,14 @@ class ModelLearning:
         return {
             "dynamics": self.dynamics.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "buffer": self.buffer[:].to_dict() if len(self.buffer) else {},
+            "buffer": self.data.state(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`; other entries of ``state`` do not matter."""
         self.dynamics.load_state_dict(state["dynamics"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self.buffer.empty()
-        if state["buffer"]:
-            self.buffer.extend(TensorDict(state["buffer"]).auto_batch_size_(1))
+        self.data.load(state["buffer"])
 
 
 def fit_metrics(fit: FitReport) -> dict[str, float]:

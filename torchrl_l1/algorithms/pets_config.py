@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from torchrl_l1.algorithms.config import (
-    ModelConfig,
+from torchrl_l1.algorithms.config import ModelConfig, check_plans
+from torchrl_l1.checks import (
     check_choice,
     check_counts,
-    check_plans,
-    check_steps,
+    check_not_negative,
+    check_optional_count,
 )
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.planning import CEMConfig
@@ -73,12 +73,9 @@ class PETSConfig:
         check_choice("label", self.label, ("nominal", "executed"))
         counts = ("outer_iterations", "random_episodes", "episodes_per_iteration", "fit_every")
         check_counts(self, *counts)
-        if self.evaluation_episodes < 0:
-            raise ValueError(
-                f"evaluation_episodes must not be negative, got {self.evaluation_episodes}"
-            )
-        check_steps("episode_steps", self.episode_steps)
-        check_steps("random_steps", self.random_steps)
+        check_not_negative("evaluation_episodes", self.evaluation_episodes)
+        check_optional_count("episode_steps", self.episode_steps)
+        check_optional_count("random_steps", self.random_steps)
         check_plans(self, "cem", self.cem.horizon)
 
     def collected_episodes(self, iterations: int) -> int:

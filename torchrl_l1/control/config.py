@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any, Literal, get_args
 
+from torchrl_l1.checks import check_choice
+
 OnSwitch = Literal["keep", "reset"]
 SwitchOn = Literal["policy", "executed"]
 FilterInput = Literal["current", "previous"]
@@ -88,8 +90,7 @@ class L1Config:
         if self.epsilon < 0:
             raise ValueError(f"epsilon must not be negative, got {self.epsilon}")
         for name, choices in _CHOICES.items():
-            if getattr(self, name) not in choices:
-                raise ValueError(f"{name} must be one of {choices}, got {getattr(self, name)!r}")
+            check_choice(name, getattr(self, name), choices)
         for name in ("a_s", "action_low", "action_high"):
             object.__setattr__(self, name, _as_scalars(name, getattr(self, name)))
         if not isinstance(self.project, bool):

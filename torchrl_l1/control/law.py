@@ -236,7 +236,9 @@ def respond(
         the executed input, the next state (but for what a switch changes) and what
         :func:`diagnose` needs.
     """
-    _check_shapes(state, observation, u_rl, change, jacobian, restart)
+    # The change at zero is the drift of :func:`step`.
+    name = "drift" if u_bar is None else "change"
+    _check_shapes(state, observation, u_rl, change, name, jacobian, restart)
     fresh = ~state.started if restart is None else ~state.started | restart
     x_hat = torch.where(fresh, observation, state.x_hat)
 
@@ -312,7 +314,8 @@ def _check_shapes(
     state: L1State,
     observation: Tensor,
     u_rl: Tensor,
-    drift: Tensor,
+    change: Tensor,
+    change_name: str,
     jacobian: Tensor,
     restart: Tensor | None,
 ) -> None:
@@ -320,7 +323,7 @@ def _check_shapes(
     for name, value, expected in (
         ("observation", observation, n),
         ("u_rl", u_rl, m),
-        ("drift", drift, n),
+        (change_name, change, n),
         ("jacobian", jacobian, (*n, m[-1])),
         ("restart", restart, state.started.shape),
     ):

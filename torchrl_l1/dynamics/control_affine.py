@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from torchrl_l1.dynamics.ensemble import ActivationName, EnsembleMLP
+from torchrl_l1.dynamics.ensemble import EnsembleMLP
 from torchrl_l1.dynamics.model import EnsembleDynamics
 
 
@@ -34,9 +34,9 @@ class ControlAffineDynamics(EnsembleDynamics):
         True
     """
 
-    def _make_network(
-        self, hidden: Sequence[int], members: int, activation: ActivationName
-    ) -> EnsembleMLP:
+    affine_in_action = True
+
+    def _make_network(self, hidden: Sequence[int], members: int, activation: str) -> EnsembleMLP:
         n, m = self.observation_dim, self.action_dim
         return EnsembleMLP(n, (1 + m) * self.head.out_features(n), hidden, members, activation)
 
@@ -46,7 +46,8 @@ class ControlAffineDynamics(EnsembleDynamics):
 
     def raw_from_output(self, output: Tensor, inputs: Tensor) -> Tensor:
         """What the head makes sense of: all of it is affine in the action, mean or not."""
-        return _affine(*self._coefficients(output), self._split(inputs)[1])
+        _, action = self._split(inputs)
+        return affine_output(*affine_coefficients(output, self.action_dim), action)
 
     def value_and_jacobian(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Mean predicted change and its derivative with respect to the action, in raw units.
@@ -58,9 +59,9 @@ class ControlAffineDynamics(EnsembleDynamics):
         """
         inputs = self.normalize_inputs(observation, action)
         flat, scaled_action = self._split(inputs.reshape(-1, inputs.shape[-1]))
-        offset, gain = self._coefficients(self._over_elites(self.network(flat)))
         n, m = self.observation_dim, self.action_dim
-        value = _affine(offset, gain, scaled_action)[..., :n]
+        offset, gain = affine_coefficients(self._over_elites(self.network(flat)), m)
+        value = affine_output(offset, gain, scaled_action)[..., :n]
         jacobian = gain[..., :n].transpose(-2, -1)
         scale = self.change_normalizer.std[:, None] / self.action_normalizer.std
         return (
@@ -85,11 +86,13 @@ class ControlAffineDynamics(EnsembleDynamics):
     def _split(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         return inputs[..., : self.observation_dim], inputs[..., self.observation_dim :]
 
-    def _coefficients(self, output: Tensor) -> tuple[Tensor, Tensor]:
-        """Offset ``(..., out)`` and transposed gain ``(..., m, out)``."""
-        rows = output.unflatten(-1, (1 + self.action_dim, -1))
-        return rows[..., 0, :], rows[..., 1:, :]
+
+def affine_coefficients(output: Tensor, action_dim: int) -> tuple[Tensor, Tensor]:
+    """Offset ``(..., out)`` and transposed gain ``(..., m, out)``, of ``(..., (1 + m) out)``."""
+    rows = output.unflatten(-1, (1 + action_dim, -1))
+    return rows[..., 0, :], rows[..., 1:, :]
 
 
-def _affine(offset: Tensor, gain: Tensor, action: Tensor) -> Tensor:
+def affine_output(offset: Tensor, gain: Tensor, action: Tensor) -> Tensor:
+    """Offset plus gain times action ``(..., m)``: ``(..., out)``."""
     return offset + (gain * action.unsqueeze(-1)).sum(-2)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Literal
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-ActivationName = Literal["relu", "tanh", "silu"]
+from torchrl_l1.checks import check_choice
 
 
 def _relu(z: Tensor) -> tuple[Tensor, Tensor]:
@@ -30,16 +30,50 @@ def _silu(z: Tensor) -> tuple[Tensor, Tensor]:
     return value, gate + value * (1 - gate)
 
 
-_VALUE: dict[str, Callable[[Tensor], Tensor]] = {
-    "relu": torch.relu,
-    "tanh": torch.tanh,
-    "silu": nn.functional.silu,
+class Activation(NamedTuple):
+    """An activation and what is computed with it.
+
+    Attributes:
+        value: the activation.
+        value_and_derivative: it and its derivative.
+        in_place: it, written over what it is applied to. At the sizes of planning a fresh tensor
+            costs as much as the activation.
+        one: what it maps to one, in bfloat16 too.
+        backward: the gradient by what it was applied to, from the gradient by what came of it,
+            the former and the latter.
+    """
+
+    value: Callable[[Tensor], Tensor]
+    value_and_derivative: Callable[[Tensor], tuple[Tensor, Tensor]]
+    in_place: Callable[[Tensor], Tensor]
+    one: float
+    backward: Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+ACTIVATIONS: dict[str, Activation] = {
+    "relu": Activation(
+        torch.relu,
+        _relu,
+        torch.relu_,
+        one=1.0,
+        backward=lambda g, z, units: torch.ops.aten.threshold_backward(g, units, 0),
+    ),
+    "tanh": Activation(
+        torch.tanh,
+        _tanh,
+        torch.tanh_,
+        one=20.0,
+        backward=lambda g, z, units: torch.ops.aten.tanh_backward(g, units),
+    ),
+    "silu": Activation(
+        nn.functional.silu,
+        _silu,
+        lambda z: nn.functional.silu(z, inplace=True),
+        one=1.2784645,
+        backward=lambda g, z, units: torch.ops.aten.silu_backward(g, z),
+    ),
 }
-_VALUE_AND_DERIVATIVE: dict[str, Callable[[Tensor], tuple[Tensor, Tensor]]] = {
-    "relu": _relu,
-    "tanh": _tanh,
-    "silu": _silu,
-}
+"""Those that hidden layers may have."""
 
 
 class EnsembleMLP(nn.Module):
@@ -54,7 +88,7 @@ class EnsembleMLP(nn.Module):
         out_features: output width.
         hidden: widths of the hidden layers.
         members: number of networks, E.
-        activation: ``"relu"``, ``"tanh"`` or ``"silu"``.
+        activation: one of :data:`ACTIVATIONS`: ``"relu"``, ``"tanh"`` or ``"silu"``.
 
     Raises:
         ValueError: for an unknown activation or a width below one.
@@ -66,11 +100,10 @@ class EnsembleMLP(nn.Module):
         out_features: int,
         hidden: Sequence[int],
         members: int,
-        activation: ActivationName = "relu",
+        activation: str = "relu",
     ) -> None:
         super().__init__()
-        if activation not in _VALUE:
-            raise ValueError(f"activation must be one of {sorted(_VALUE)}, got {activation!r}")
+        check_choice("activation", activation, tuple(ACTIVATIONS))
         widths = [in_features, *hidden, out_features]
         if members < 1 or min(widths) < 1:
             raise ValueError(f"members and widths must be positive, got {members} and {widths}")
@@ -88,7 +121,7 @@ class EnsembleMLP(nn.Module):
         """All members on shared ``(B, in)`` or their own ``(E, B, in)`` inputs: ``(E, B, out)``."""
         if x.dim() == 2:
             x = x.expand(self.members, *x.shape)
-        activation = _VALUE[self.activation]
+        activation = ACTIVATIONS[self.activation].value
         last = len(self.weights) - 1
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             # Not baddbmm, which first copies the bias to every row.
@@ -99,7 +132,7 @@ class EnsembleMLP(nn.Module):
 
     def forward_member(self, x: Tensor, member: int) -> Tensor:
         """One member alone: ``(B, in)`` to ``(B, out)``."""
-        activation = _VALUE[self.activation]
+        activation = ACTIVATIONS[self.activation].value
         last = len(self.weights) - 1
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             x = torch.addmm(bias[member], x, weight[member])
@@ -126,7 +159,7 @@ class EnsembleMLP(nn.Module):
             outputs ``(E, B, out)`` and derivatives ``(E, B, d, out)``.
         """
         batch, directions = x.shape[0], last - first
-        activation = _VALUE_AND_DERIVATIVE[self.activation]
+        activation = ACTIVATIONS[self.activation].value_and_derivative
         shared = x.expand(self.members, *x.shape)
         z = torch.baddbmm(self.biases[0], shared, self.weights[0])
         tangent = self.weights[0][:, None, first:last, :].expand(-1, batch, -1, -1)
@@ -154,8 +187,8 @@ class EnsembleMLP(nn.Module):
         Returns:
             ``f(x + step) - f(x) - Df(x) step``, ``(E, B, out)``.
         """
-        activation, batch = _VALUE_AND_DERIVATIVE[self.activation], x.shape[0]
-        displaced_activation = _VALUE[self.activation]
+        activation, batch = ACTIVATIONS[self.activation].value_and_derivative, x.shape[0]
+        displaced_activation = ACTIVATIONS[self.activation].value
         both = torch.cat([x, step]).expand(self.members, -1, -1) @ self.weights[0]
         z, tangent = both[:, :batch] + self.biases[0], both[:, batch:]
         displaced = z + tangent
@@ -192,7 +225,7 @@ class EnsembleMLP(nn.Module):
             function of a mask ``(B,)``, true where the second is selected, which gives outputs
             ``(E, B, out)`` and derivatives ``(E, B, d, out)`` there.
         """
-        activation, batch = _VALUE_AND_DERIVATIVE[self.activation], x.shape[1]
+        activation, batch = ACTIVATIONS[self.activation].value_and_derivative, x.shape[1]
         # Once each: a ParameterList takes as long to read as a small sum.
         weights, biases = list(self.weights), list(self.biases)
         hidden = x.flatten(0, 1).expand(self.members, -1, -1)

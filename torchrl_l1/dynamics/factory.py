@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
+from torchrl_l1.checks import check_choice
 from torchrl_l1.dynamics.control_affine import ControlAffineDynamics
 from torchrl_l1.dynamics.heads import Head, make_head
 from torchrl_l1.dynamics.model import EnsembleDynamics
@@ -40,9 +41,7 @@ def make_dynamics(
         >>> make_dynamics(4, 1, "affine", hidden=(128, 128)).network.weights[0].shape
         torch.Size([5, 4, 127])
     """
-    if form not in MODEL_FORMS:
-        allowed = " or ".join(map(repr, MODEL_FORMS))
-        raise ValueError(f"form must be {allowed}, got {form!r}")
+    check_choice("form", form, MODEL_FORMS)
     if isinstance(head, str):
         head = make_head(head, observation_dim)
     settings = {**settings, "head": head}

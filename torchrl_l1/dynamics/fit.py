@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -13,6 +12,13 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.objectives.common import LossModule
 
+from torchrl_l1.checks import (
+    check_counts,
+    check_not_negative,
+    check_optional_count,
+    check_positive,
+    check_within,
+)
 from torchrl_l1.dynamics.model import EnsembleDynamics
 from torchrl_l1.dynamics.network import model_precision, resolve_precision
 from torchrl_l1.dynamics.training_step import TrainingStep
@@ -61,27 +67,16 @@ class FitConfig:
     precision: str = "float32"
 
     def __post_init__(self) -> None:
-        for name in ("batch_size", "max_epochs", "max_gradient_steps", "patience"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"fit.{name} must be at least 1, got {getattr(self, name)}")
-        if not 0 < self.validation_fraction < 1:
-            raise ValueError(
-                f"fit.validation_fraction must be between 0 and 1, got {self.validation_fraction}"
-            )
-        if self.learning_rate <= 0:
-            raise ValueError(f"fit.learning_rate must be positive, got {self.learning_rate}")
-        if not 0 < self.final_learning_rate_fraction <= 1:
-            raise ValueError(
-                "fit.final_learning_rate_fraction must be positive and at most 1, got "
-                f"{self.final_learning_rate_fraction}"
-            )
-        if not all(0 <= coefficient < math.inf for coefficient in self.weight_decay):
-            raise ValueError(
-                "fit.weight_decay must hold finite coefficients, none negative, got "
-                f"{list(self.weight_decay)}"
-            )
-        if self.elites is not None and self.elites < 1:
-            raise ValueError(f"fit.elites must be at least 1 or null, got {self.elites}")
+        counts = ("batch_size", "max_epochs", "max_gradient_steps", "patience")
+        check_counts(self, *counts, prefix="fit.")
+        check_within("fit.validation_fraction", self.validation_fraction, "(0, 1)")
+        check_positive("fit.learning_rate", self.learning_rate)
+        fraction = self.final_learning_rate_fraction
+        check_within("fit.final_learning_rate_fraction", fraction, "(0, 1]")
+        check_not_negative("fit.weight_penalty", self.weight_penalty)
+        for layer, coefficient in enumerate(self.weight_decay):
+            check_not_negative(f"fit.weight_decay[{layer}]", coefficient)
+        check_optional_count("fit.elites", self.elites)
         resolve_precision(self.precision, name="fit.precision")
 
 
@@ -155,24 +150,11 @@ class EnsembleDynamicsLoss(LossModule):
         model = self.dynamics
         inputs = model.normalize_inputs(observation, action)
         target = model.change_normalizer.normalize(next_observation - observation)
-        objective, per_member = self.objective(inputs, target)
+        per_member = model.head.loss(model.raw(inputs), target).mean(-1)
+        objective = per_member.sum() + model.head.penalty()
         return TensorDict(
             {"loss_dynamics": objective, "member_loss": per_member.detach()}, batch_size=[]
         )
-
-    def objective(self, inputs: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        """What :meth:`forward` gives, from normalised inputs and targets.
-
-        Args:
-            inputs: ``(B, n + m)``, or of each member's own batch ``(E, B, n + m)``.
-            target: ``(B, n)`` or ``(E, B, n)``.
-
-        Returns:
-            the objective and the members' losses ``(E,)``, not detached.
-        """
-        head = self.dynamics.head
-        per_member = head.loss(self.dynamics.raw(inputs), target).mean(-1)
-        return per_member.sum() + head.penalty(), per_member
 
 
 @dataclass
@@ -201,6 +183,32 @@ def evaluate_members(
     for part in data.split(chunk):
         total = total.to(part.device) + loss(part)["member_loss"] * part.shape[0]
     return total / data.shape[0]
+
+
+def split_validation(
+    buffer: ReplayBuffer, purpose: str, items: str, setting: str
+) -> tuple[TensorDictBase, TensorDictBase]:
+    """What there is to train on, and what its flag ``validation`` ``(N,)`` keeps out of it.
+
+    Args:
+        buffer: the items.
+        purpose: what they are for, for the error.
+        items: what they are called there.
+        setting: the one that says how many are kept out.
+
+    Raises:
+        ValueError: if there is nothing to train or to validate on.
+    """
+    empty = TensorDict({"validation": torch.zeros(0, dtype=torch.bool)}, batch_size=[0])
+    data = buffer[:] if len(buffer) else empty
+    held_out = data["validation"].reshape(-1)
+    train, validation = data[~held_out], data[held_out]
+    if train.shape[0] == 0 or validation.shape[0] == 0:
+        raise ValueError(
+            f"cannot {purpose}: {train.shape[0]} training and {validation.shape[0]} validation "
+            f"{items}; collect more data or change {setting}"
+        )
+    return train, validation
 
 
 def fit_ensemble(
@@ -233,7 +241,10 @@ def fit_ensemble(
     """
     _check(config, dynamics)
     device = next(dynamics.parameters()).device
-    train, validation = (part.to(device) for part in _split(buffer, action_key))
+    train, validation = (
+        _transitions(part, action_key).to(device)
+        for part in split_validation(buffer, "fit", "transitions", "fit.validation_fraction")
+    )
     dynamics.train()
     change = train["next", "observation"] - train["observation"]
     dynamics.fit_statistics(train["observation"], train["action"], change)
@@ -327,9 +338,9 @@ def _decay(config: FitConfig, layers: int, size: int) -> list[float]:
     return [coefficient + hidden for coefficient in given[:-1]] + given[-1:]
 
 
-def _split(buffer: ReplayBuffer, action_key: str) -> tuple[TensorDict, TensorDict]:
-    data = buffer[:]
-    transitions = TensorDict(
+def _transitions(data: TensorDictBase, action_key: str) -> TensorDict:
+    """What :class:`EnsembleDynamicsLoss` reads, with the action that is the label."""
+    return TensorDict(
         {
             "observation": data["observation"],
             "action": data[action_key],
@@ -337,11 +348,3 @@ def _split(buffer: ReplayBuffer, action_key: str) -> tuple[TensorDict, TensorDic
         },
         batch_size=[data.shape[0]],
     )
-    held_out = data["validation"].reshape(-1)
-    train, validation = transitions[~held_out], transitions[held_out]
-    if train.shape[0] == 0 or validation.shape[0] == 0:
-        raise ValueError(
-            f"cannot fit: {train.shape[0]} training and {validation.shape[0]} validation "
-            "transitions; collect more data or change validation_fraction"
-        )
-    return train, validation

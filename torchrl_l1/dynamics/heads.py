@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from torchrl_l1.checks import check_choice, check_count, check_not_negative
+
 HEADS = ("deterministic", "gaussian")
 
 
@@ -127,15 +129,13 @@ class GaussianHead(Head):
         bound_penalty: float = 0.01,
     ) -> None:
         super().__init__()
-        if dim < 1:
-            raise ValueError(f"dim must be at least 1, got {dim}")
+        check_count("dim", dim)
         if not -math.inf < min_log_variance < max_log_variance < math.inf:
             raise ValueError(
                 "min_log_variance must be below max_log_variance, and both finite, got "
                 f"{min_log_variance} and {max_log_variance}"
             )
-        if not 0 <= bound_penalty < math.inf:
-            raise ValueError(f"bound_penalty must be finite and not negative, got {bound_penalty}")
+        check_not_negative("bound_penalty", bound_penalty)
         self.dim = dim
         self.bound_penalty = bound_penalty
         self.min_log_variance = nn.Parameter(torch.full((dim,), float(min_log_variance)))
@@ -237,6 +237,5 @@ def make_head(name: str, dim: int) -> Head:
         >>> make_head("gaussian", 3).out_features(3)
         6
     """
-    if name not in HEADS:
-        raise ValueError(f"head must be {' or '.join(map(repr, HEADS))}, got {name!r}")
+    check_choice("head", name, tuple(HEADS))
     return GaussianHead(dim) if name == "gaussian" else DeterministicHead()

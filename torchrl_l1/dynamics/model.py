@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchrl_l1.dynamics.ensemble import ActivationName, EnsembleMLP
+from torchrl_l1.dynamics.ensemble import EnsembleMLP
 from torchrl_l1.dynamics.heads import DeterministicHead, Head
 from torchrl_l1.dynamics.normalizer import DataBox, Normalizer
 
@@ -35,6 +35,9 @@ class EnsembleDynamics(nn.Module):
     Attributes:
         elites: indices of the members that the ensemble's mean is over, ascending, ``(k,)``; all
             of them until :meth:`set_elites`.
+        affine_in_action: whether members give the coefficients of a function that is affine in
+            the action, which their networks then do not read: a :class:`ControlAffineDynamics`.
+            Planning networks and fits go by it.
 
     Examples:
         >>> import torch
@@ -45,6 +48,7 @@ class EnsembleDynamics(nn.Module):
     """
 
     elites: Tensor
+    affine_in_action: bool = False
 
     def __init__(
         self,
@@ -52,7 +56,7 @@ class EnsembleDynamics(nn.Module):
         action_dim: int,
         members: int = 5,
         hidden: Sequence[int] = (256, 256),
-        activation: ActivationName = "relu",
+        activation: str = "relu",
         std_floor: float = 1e-4,
         box_margin: float = 0.5,
         head: Head | None = None,
@@ -68,9 +72,7 @@ class EnsembleDynamics(nn.Module):
         self.change_normalizer = Normalizer(observation_dim, std_floor)
         self.box = DataBox(observation_dim, box_margin)
 
-    def _make_network(
-        self, hidden: Sequence[int], members: int, activation: ActivationName
-    ) -> EnsembleMLP:
+    def _make_network(self, hidden: Sequence[int], members: int, activation: str) -> EnsembleMLP:
         n, m = self.observation_dim, self.action_dim
         return EnsembleMLP(n + m, self.head.out_features(n), hidden, members, activation)
 

@@ -12,20 +12,14 @@ from time import perf_counter
 from typing import Any, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from torchrl_l1.dynamics.control_affine import affine_coefficients, affine_output
+from torchrl_l1.dynamics.ensemble import ACTIVATIONS
 from torchrl_l1.dynamics.heads import DeterministicHead
 from torchrl_l1.dynamics.model import EnsembleDynamics
 
 Precision = Literal["auto", "float32", "bfloat16"]
-
-# In place: at the sizes of planning a fresh tensor costs as much as the activation. With each,
-# what it maps to one, in bfloat16 too.
-_ACTIVATIONS: dict[str, tuple[Callable[[Tensor], Tensor], float]] = {
-    "relu": (torch.relu_, 1.0),
-    "tanh": (torch.tanh_, 20.0),
-    "silu": (lambda z: nn.functional.silu(z, inplace=True), 1.2784645),
-}
 
 # Widths of hidden layers are filled up to multiples of this.
 _ALIGNMENT = 16
@@ -111,6 +105,7 @@ class PlanningNetwork:
         activation: activation of the hidden layers, in place.
         standard_deviation: maps a member's raw output to the standard deviation of its
             prediction, normalised units; ``None`` if it predicts points.
+        affine_in_action: as of the ensemble.
 
     Examples:
         >>> model = EnsembleDynamics(3, 1, members=2, hidden=(8, 8))
@@ -129,6 +124,7 @@ class PlanningNetwork:
     change_std: Tensor
     activation: Callable[[Tensor], Tensor]
     standard_deviation: Callable[[Tensor], Tensor] | None = None
+    affine_in_action: bool = False
 
     @classmethod
     @torch.no_grad()
@@ -146,13 +142,13 @@ class PlanningNetwork:
         weights = [weight[elites].double() for weight in dynamics.network.weights]
         biases = [bias[elites, 0].double() for bias in dynamics.network.biases]
         _fold_inputs(dynamics, weights, biases)
-        activation, one = _ACTIVATIONS[dynamics.network.activation]
-        _fold_biases(weights, biases, one)
+        activation = ACTIVATIONS[dynamics.network.activation]
+        _fold_biases(weights, biases, activation.one)
         # Between the layers of hidden units, and from the last to an output that is a small
         # correction of the state. That of a control-affine model may be a difference of large ones.
         last = len(weights) - 1
-        affine = dynamics.network.weights[0].shape[1] == dynamics.observation_dim
-        low = range(1, last if affine else last + 1) if last > 1 else range(0)
+        end = last if dynamics.affine_in_action else last + 1
+        low = range(1, end) if last > 1 else range(0)
         point = isinstance(dynamics.head, DeterministicHead)
         return cls(
             weights=[
@@ -164,8 +160,9 @@ class PlanningNetwork:
             action_dim=dynamics.action_dim,
             change_mean=dynamics.change_normalizer.mean.to(torch.float32, copy=True),
             change_std=dynamics.change_normalizer.std.to(torch.float32, copy=True),
-            activation=activation,
+            activation=activation.in_place,
             standard_deviation=None if point else deepcopy(dynamics.head).standard_deviation,
+            affine_in_action=dynamics.affine_in_action,
         )
 
     @property
@@ -247,22 +244,10 @@ class ForwardPass:
                     operand.copy_(units)
                 torch.mm(operand, weight, out=out)
         raw = self._out.float()
-        if self._width == inputs.shape[1]:
+        if not self._network.affine_in_action:
             return raw
-        return affine_output(raw, inputs[:, self._width :].repeat(self._copies, 1))
-
-
-def affine_output(raw: Tensor, action: Tensor) -> Tensor:
-    """Raw output of a control-affine model, whose network gives offset and gain.
-
-    Args:
-        raw: the network's output ``(..., (1 + m) out)``, or what is returned if m is zero.
-        action: what the network has not seen, ``(..., m)``.
-    """
-    if action.shape[-1] == 0:
-        return raw
-    parts = raw.unflatten(-1, (1 + action.shape[-1], -1))
-    return parts[..., 0, :] + (parts[..., 1:, :] * action[..., None]).sum(-2)
+        action = inputs[:, self._width :].repeat(self._copies, 1)
+        return affine_output(*affine_coefficients(raw, self._network.action_dim), action)
 
 
 _Layer = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -308,13 +293,13 @@ def _fold_inputs(dynamics: EnsembleDynamics, weights: list[Tensor], biases: list
     width = weights[0].shape[1]
     weights[0] = weights[0] / std[:width, None]
     biases[0] = biases[0] - mean[:width] @ weights[0]
-    if width == mean.shape[0]:
+    if not dynamics.affine_in_action:
         return
     for layers in (weights, biases):
-        rows = layers[-1].unflatten(-1, (1 + dynamics.action_dim, -1))
-        gain = rows[..., 1:, :] / action.std.double()[:, None]
-        offset = rows[..., :1, :] - (action.mean.double()[:, None] * gain).sum(-2, keepdim=True)
-        layers[-1] = torch.cat([offset, gain], -2).flatten(-2)
+        offset, gain = affine_coefficients(layers[-1], dynamics.action_dim)
+        gain = gain / action.std.double()[:, None]
+        offset = affine_output(offset, gain, -action.mean.double())
+        layers[-1] = torch.cat([offset[..., None, :], gain], -2).flatten(-2)
 
 
 def _fold_biases(weights: list[Tensor], biases: list[Tensor], one: float) -> None:

@@ -2,29 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Literal
 
 import torch
 from torch import Tensor
-from torch.nn.functional import silu
 
+from torchrl_l1.dynamics.ensemble import ACTIVATIONS
 from torchrl_l1.dynamics.model import EnsembleDynamics
-
-# Of each activation: it, and the gradient by what it was applied to, from the gradient by what
-# came of it, the former and the latter.
-_ACTIVATIONS: dict[
-    str, tuple[Callable[[Tensor], Tensor], Callable[[Tensor, Tensor, Tensor], Tensor]]
-] = {
-    "relu": (torch.relu, lambda g, z, units: torch.ops.aten.threshold_backward(g, units, 0)),
-    "tanh": (torch.tanh, lambda g, z, units: torch.ops.aten.tanh_backward(g, units)),
-    "silu": (silu, lambda g, z, units: torch.ops.aten.silu_backward(g, z)),
-}
 
 
 class TrainingStep:
     """Losses of all members on a batch, and the gradients of what a fit minimises.
 
+    The objective is that of :class:`~torchrl_l1.dynamics.EnsembleDynamicsLoss`, computed faster,
+    and the decay: see ``test_the_objective_is_that_of_the_loss`` in ``test_training_step.py``.
     The network's derivatives are written out here, those of the head are its own business. In
     ``bfloat16`` the products between hidden layers and from the last one, forward and back, and
     what is between them are of that precision; parameters, gradients, sums over a batch, the
@@ -53,7 +44,7 @@ class TrainingStep:
     ) -> None:
         network = dynamics.network
         self.dynamics, self.decay = dynamics, decay or []
-        self._apply, self._differentiate = _ACTIVATIONS[network.activation]
+        self._activation = ACTIVATIONS[network.activation]
         self._weights = [weight.detach() for weight in network.weights]
         self._biases = [bias.detach() for bias in network.biases]
         full = self._weights[0].dtype
@@ -84,7 +75,7 @@ class TrainingStep:
                 z = z.to(bias.dtype)
             sums.append(z.add_(bias.to(z.dtype)))
             if layer < last:
-                operands.append(self._apply(z).to(self._dtypes[layer + 1]))
+                operands.append(self._activation.value(z).to(self._dtypes[layer + 1]))
         losses, gradient = self._head(sums.pop(), inputs, target)
         for layer in range(last, -1, -1):
             by_weight = self._by_weights[layer]
@@ -97,7 +88,7 @@ class TrainingStep:
             if layer:
                 z, units = sums[layer - 1], operands.pop()
                 gradient = torch.bmm(gradient, weights[layer].mT).to(z.dtype)
-                gradient = self._differentiate(gradient, z, units.to(z.dtype))
+                gradient = self._activation.backward(gradient, z, units.to(z.dtype))
         for coefficient, by_weight, weight in zip(
             self.decay, self._by_weights, self._weights, strict=False
         ):
@@ -106,13 +97,14 @@ class TrainingStep:
 
     def _head(self, output: Tensor, inputs: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         """The members' losses and the gradient by the network's output ``(E, B, out)``."""
-        head = self.dynamics.head
+        dynamics = self.dynamics
+        if not dynamics.affine_in_action:
+            return dynamics.head.loss_and_gradient(output, target)
         with torch.enable_grad():
-            leaf = output.requires_grad_()
-            raw = self.dynamics.raw_from_output(leaf, inputs)
-        losses, gradient = head.loss_and_gradient(raw.detach(), target)
-        if raw is not leaf:
-            (gradient,) = torch.autograd.grad(raw, leaf, gradient)
+            output.requires_grad_()
+            raw = dynamics.raw_from_output(output, inputs)
+        losses, by_raw = dynamics.head.loss_and_gradient(raw.detach(), target)
+        (gradient,) = torch.autograd.grad(raw, output, by_raw)
         return losses, gradient
 
 

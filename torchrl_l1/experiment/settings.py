@@ -23,7 +23,8 @@ from torchrl_l1.algorithms import (
 )
 from torchrl_l1.algorithms.algorithm import DEVICES
 from torchrl_l1.algorithms.metrpo_config import check_clipping
-from torchrl_l1.compilation import CompileMode
+from torchrl_l1.checks import check_choice, check_count, check_optional_count
+from torchrl_l1.compilation import CompileMode, check_mode
 from torchrl_l1.control import L1Config
 from torchrl_l1.envs import get_task
 
@@ -124,12 +125,9 @@ class RunSettings(ABC):
                 f"algorithm is {fixed!r} by the recipe's schema, got {self.algorithm!r}; choose "
                 f"a recipe of {self.algorithm} instead"
             )
-        if self.device not in DEVICES:
-            raise ValueError(f"device must be {' or '.join(DEVICES)}, got {self.device!r}")
-        if self.threads < 1:
-            raise ValueError(f"threads must be at least 1, got {self.threads}")
-        if self.horizon is not None and self.horizon < 1:
-            raise ValueError(f"horizon must be at least 1 or null, got {self.horizon}")
+        check_choice("device", self.device, DEVICES)
+        check_count("threads", self.threads)
+        check_optional_count("horizon", self.horizon)
 
     @abstractmethod
     def collected_episodes(self, iterations: int) -> int:
@@ -207,9 +205,7 @@ def compile_mode(setting: bool | str) -> CompileMode:
     Raises:
         ValueError: if it is none of true, false and auto.
     """
-    if setting not in (True, False, "auto"):
-        raise ValueError(f"l1.compile must be true, false or auto, got {setting!r}")
-    return setting  # type: ignore[return-value]
+    return check_mode(setting, "l1.compile")
 
 
 # The algorithm's settings come first: they say how many outer iterations there are.
@@ -228,8 +224,7 @@ class METRPORecipe(METRPOConfig, RunSettings):
     def __post_init__(self) -> None:
         self.check()
         check_clipping(self.clip_actions, self.l1.enabled)
-        if self.published_horizon < 1:
-            raise ValueError(f"published_horizon must be at least 1, got {self.published_horizon}")
+        check_count("published_horizon", self.published_horizon)
 
 
 @dataclass

@@ -13,6 +13,8 @@ from torch import Tensor
 from torch.distributions import Distribution, kl_divergence
 from torch.nn.utils import parameters_to_vector
 
+from torchrl_l1.checks import check_counts, check_not_negative, check_positive, check_within
+
 
 @dataclass
 class TRPOConfig:
@@ -37,15 +39,12 @@ class TRPOConfig:
     accept_ratio: float = 0.1
 
     def __post_init__(self) -> None:
-        for name in ("max_kl", "cg_iterations", "max_backtracks"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"trpo.{name} must be positive, got {getattr(self, name)}")
-        if self.damping < 0:
-            raise ValueError(f"trpo.damping must not be negative, got {self.damping}")
-        if not 0 < self.fisher_fraction <= 1:
-            raise ValueError(f"trpo.fisher_fraction must be in (0, 1], got {self.fisher_fraction}")
-        if not 0 < self.backtrack_ratio < 1:
-            raise ValueError(f"trpo.backtrack_ratio must be in (0, 1), got {self.backtrack_ratio}")
+        check_positive("trpo.max_kl", self.max_kl)
+        check_counts(self, "cg_iterations", "max_backtracks", prefix="trpo.")
+        check_not_negative("trpo.damping", self.damping)
+        check_within("trpo.fisher_fraction", self.fisher_fraction, "(0, 1]")
+        check_within("trpo.backtrack_ratio", self.backtrack_ratio, "(0, 1)")
+        check_not_negative("trpo.accept_ratio", self.accept_ratio)
 
 
 @dataclass

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from torchrl_l1.checks import check_counts, check_not_negative, check_positive, check_within
 from torchrl_l1.planning.sequences import (
     Evaluate,
     Plan,
@@ -16,7 +16,6 @@ from torchrl_l1.planning.sequences import (
     evaluated,
     initial_variance,
     keep_best,
-    require,
     sample_around,
     select,
 )
@@ -51,27 +50,16 @@ class CEMConfig:
     return_best: bool = False
 
     def __post_init__(self) -> None:
-        require(
-            self,
-            horizon=(1, math.inf),
-            candidates=(1, math.inf),
-            elites=(1, math.inf),
-            iterations=(1, math.inf),
-            momentum=(0, 1),
-            minimum_variance=(0, math.inf),
-        )
+        check_counts(self, "horizon", "candidates", "elites", "iterations", prefix="cem.")
         if self.elites > self.candidates:
             raise ValueError(
-                f"CEMConfig.elites ({self.elites}) must not exceed CEMConfig.candidates "
-                f"({self.candidates})"
+                f"cem.elites ({self.elites}) must not exceed cem.candidates ({self.candidates})"
             )
-        if self.momentum == 1:
-            raise ValueError("CEMConfig.momentum must be below 1: at 1 nothing is ever learnt")
-        if self.initial_variance is not None and not 0 < self.initial_variance < math.inf:
-            raise ValueError(
-                "CEMConfig.initial_variance must be positive and finite, got "
-                f"{self.initial_variance}"
-            )
+        # At 1 nothing would ever be learnt.
+        check_within("cem.momentum", self.momentum, "[0, 1)")
+        if self.initial_variance is not None:
+            check_positive("cem.initial_variance", self.initial_variance)
+        check_not_negative("cem.minimum_variance", self.minimum_variance)
 
 
 @torch.no_grad()

@@ -14,8 +14,9 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from torchrl_l1.compilation import CompileMode, compiled
-from torchrl_l1.dynamics.network import PlanningNetwork, affine_output
+from torchrl_l1.compilation import CompileMode, check_mode, compiled
+from torchrl_l1.dynamics.control_affine import affine_coefficients, affine_output
+from torchrl_l1.dynamics.network import PlanningNetwork
 from torchrl_l1.planning.particles import Draws, Predict, Propagation
 
 _Group = tuple[int, int, int]
@@ -44,7 +45,7 @@ def resolve_compilation(
     Raises:
         ValueError: for another mode, or ``True`` with ``"ts1"``.
     """
-    if mode is False:
+    if check_mode(mode, name) is False:
         return False
     serves = propagation != "ts1"
     if mode is True:
@@ -54,8 +55,6 @@ def resolve_compilation(
                 f"set {name} to False or 'auto', or propagation to 'tsinf' or 'mean'"
             )
         return True
-    if mode != "auto":
-        raise ValueError(f"{name} must be True, False or 'auto', got {mode!r}")
     return serves and torch.device(device).type == "cuda" and _has_compiler()
 
 
@@ -141,7 +140,10 @@ def _raw(network: PlanningNetwork, first: int, last: int, inputs: Tensor) -> Ten
     units = torch.baddbmm(network.bias[first:last, None], inputs[..., :width], weight[first:last])
     for weight in following:
         units = torch.bmm(network.activation(units).to(weight.dtype), weight[first:last])
-    return affine_output(units.float(), inputs[..., width:])
+    raw = units.float()
+    if not network.affine_in_action:
+        return raw
+    return affine_output(*affine_coefficients(raw, network.action_dim), inputs[..., width:])
 
 
 def _has_compiler() -> bool:

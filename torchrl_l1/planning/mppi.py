@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from torchrl_l1.checks import check_counts, check_positive
 from torchrl_l1.planning.sequences import (
     Evaluate,
     Plan,
@@ -16,7 +16,6 @@ from torchrl_l1.planning.sequences import (
     evaluated,
     initial_variance,
     keep_best,
-    require,
     sample_around,
 )
 
@@ -43,16 +42,10 @@ class MPPIConfig:
     return_best: bool = False
 
     def __post_init__(self) -> None:
-        require(
-            self,
-            horizon=(1, math.inf),
-            candidates=(1, math.inf),
-            iterations=(1, math.inf),
-        )
-        for name in ("temperature", "variance"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise ValueError(f"MPPIConfig.{name} must be positive and finite, got {value}")
+        check_counts(self, "horizon", "candidates", "iterations", prefix="mppi.")
+        check_positive("mppi.temperature", self.temperature)
+        if self.variance is not None:
+            check_positive("mppi.variance", self.variance)
 
 
 @torch.no_grad()

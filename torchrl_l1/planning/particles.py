@@ -34,8 +34,7 @@ class Draws:
 
     Args:
         network: the members.
-        shares: particles of each member, see
-            :func:`torchrl_l1.planning.particles.member_shares`.
+        shares: particles of each member, see :func:`member_shares`.
         count: number of trajectories, B.
         horizon: number of steps.
         common: what all candidates draw; each draws its own if ``None``.

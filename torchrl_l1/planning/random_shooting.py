@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from torchrl_l1.checks import check_counts
 from torchrl_l1.planning.sequences import (
     Evaluate,
     Plan,
@@ -15,7 +15,6 @@ from torchrl_l1.planning.sequences import (
     checked_mean,
     evaluated,
     keep_best,
-    require,
 )
 
 
@@ -35,7 +34,7 @@ class ShootingConfig:
     warm_start: bool = True
 
     def __post_init__(self) -> None:
-        require(self, horizon=(1, math.inf), candidates=(1, math.inf))
+        check_counts(self, "horizon", "candidates", prefix="shooting.")
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""What the optimisers of action sequences share: their contract, checks and sampling."""
+"""What the optimisers of action sequences share: their contract, checks of arguments, sampling."""
 
 from __future__ import annotations
 
@@ -29,20 +29,6 @@ class Plan(NamedTuple):
     variance: Tensor
     best: Tensor
     best_return: Tensor
-
-
-def require(settings: object, **limits: tuple[float, float]) -> None:
-    """Refuse settings outside ``[low, high]``.
-
-    Raises:
-        ValueError: naming the first such setting.
-    """
-    for name, (low, high) in limits.items():
-        value = getattr(settings, name)
-        if not low <= value <= high:  # so written because NaN fails every comparison
-            raise ValueError(
-                f"{type(settings).__name__}.{name} must be in [{low:g}, {high:g}], got {value}"
-            )
 
 
 def checked_bounds(

@@ -9,6 +9,7 @@ from typing import get_args
 import torch
 from torch import Tensor
 
+from torchrl_l1.checks import check_choice, check_count, check_optional_count, check_within
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.dynamics.network import (
@@ -239,12 +240,10 @@ def check_sampling(
         ValueError: naming the setting.
     """
     resolve_precision(precision)
-    if propagation not in get_args(Propagation):
-        raise ValueError(f"propagation must be one of {get_args(Propagation)}, got {propagation!r}")
-    if particles < 1 or (block is not None and block < 1):
-        raise ValueError(f"particles and block must be positive, got {particles} and {block}")
-    if not 0 < discount <= 1:
-        raise ValueError(f"discount must be in (0, 1], got {discount}")
+    check_choice("propagation", propagation, get_args(Propagation))
+    check_count("particles", particles)
+    check_optional_count("block", block)
+    check_within("discount", discount, "(0, 1]")
     resolve_compilation(compile, propagation=propagation)
 
 
