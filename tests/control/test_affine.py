@@ -1,8 +1,13 @@
 from __future__ import annotations
 
+import itertools
+
+import numpy as np
+import pytest
 import torch
 
-from torchrl_l1.control import ActionJacobian, affinize, switching_law
+from torchrl_l1.control import ActionJacobian, L1Config, affinize, augment, init, switching_law
+from torchrl_l1.dynamics import EnsembleDynamics
 
 
 def quadratic(observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
@@ -60,3 +65,210 @@ def test_switching_law_without_batch_dimensions():
     switch, error = switching_law(MODEL, x, u_bar, u, 0.0)
     assert switch.shape == error.shape == (1,)
     assert switch.all()
+
+
+N, M, DT = 4, 2, 0.05
+RNG = np.random.default_rng(0)
+A = 0.1 * RNG.normal(size=(N, N))
+B = RNG.normal(size=(N, M))
+C = 0.3 * RNG.normal(size=(N, M))
+TENSORS = tuple(torch.as_tensor(matrix) for matrix in (A, B, C))
+
+
+def numpy_model(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    return A @ x + B @ np.tanh(u) + C @ u**2 * np.cos(x[0])
+
+
+def numpy_gradient(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    return B / np.cosh(u) ** 2 + 2 * C * u * np.cos(x[0])
+
+
+def torch_model(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+    a, b, c = (matrix.to(x.dtype) for matrix in TENSORS)
+    return x @ a.T + u.tanh() @ b.T + u.square() @ c.T * x[..., :1].cos()
+
+
+CHOICES = list(
+    itertools.product(["keep", "reset"], ["policy", "executed"], ["current", "previous"])
+)
+
+
+@pytest.mark.parametrize(("on_switch", "switch_on", "filter_input"), CHOICES)
+def test_agrees_with_algorithm_2(numpy_l1, on_switch, switch_on, filter_input):
+    epsilon, batch, bound, reset_at = 0.4, 4, 0.9, 9
+    config = L1Config(
+        DT,
+        epsilon=epsilon,
+        on_switch=on_switch,
+        switch_on=switch_on,
+        filter_input=filter_input,
+        action_low=-bound,
+        action_high=bound,
+    )
+
+    def controller():
+        return numpy_l1(
+            DT, 0.35 / DT, -np.ones(N), -bound, bound, epsilon, on_switch, switch_on, filter_input
+        )
+
+    oracles = [controller() for _ in range(batch)]
+    state = init([batch], N, M, dtype=torch.float64)
+    model = ActionJacobian(torch_model)
+    rng = np.random.default_rng(1)
+    x = rng.normal(size=(batch, N))
+    switches = 0
+    for t in range(20):
+        u_rl = rng.uniform(-1.2, 1.2, size=(batch, M))
+        if t == reset_at:  # one environment of N is reset
+            oracles[2] = controller()
+            x[2] = rng.normal(size=N)
+            fresh = init([batch], N, M, dtype=torch.float64)
+            mask = torch.arange(batch).unsqueeze(-1) == 2
+            state = type(state)(
+                *(torch.where(mask, f, s) for f, s in zip(fresh, state, strict=True))
+            )
+        u, state, diagnostics = augment(
+            config, model, state, torch.as_tensor(x), torch.as_tensor(u_rl)
+        )
+        expected = np.stack(
+            [o.augment(x[i], u_rl[i], numpy_model, numpy_gradient) for i, o in enumerate(oracles)]
+        )
+        np.testing.assert_allclose(u, expected, atol=1e-10)
+        for name in ("x_hat", "u_bar", "q", "sigma_m"):
+            want = np.stack([getattr(oracle, name) for oracle in oracles])
+            np.testing.assert_allclose(getattr(state, name), want, atol=1e-10, err_msg=name)
+        assert state.n_switch.squeeze(-1).tolist() == [oracle.n_switch for oracle in oracles]
+        for i, oracle in enumerate(oracles):
+            if "error" in oracle.log:
+                assert diagnostics.affinization_error[i].item() == pytest.approx(
+                    oracle.log["error"], abs=1e-10
+                )
+        switches += int(diagnostics.switch.sum())
+        # The plant disagrees with the model.
+        x = x + np.stack([numpy_model(a, b + 0.3) for a, b in zip(x, u.numpy(), strict=True)])
+    assert 5 < switches < 20 * batch
+
+
+def test_first_step_is_no_switch_and_adds_nothing():
+    for epsilon in (0.0, 1.0):
+        config = L1Config(DT, epsilon=epsilon)
+        x, u_rl = torch.randn(3, N), torch.randn(3, M)
+        u, state, diagnostics = augment(
+            config, ActionJacobian(torch_model), init([3], N, M), x, u_rl
+        )
+        torch.testing.assert_close(u, u_rl, atol=0, rtol=0)
+        torch.testing.assert_close(state.u_bar, u_rl, atol=0, rtol=0)
+        assert not diagnostics.switch.any() and not state.n_switch.any()
+        assert diagnostics.affinization_error.abs().max() == 0
+        assert state.started.all()
+        # The remembered operating point is a copy.
+        u_rl.zero_()
+        assert state.u_bar.abs().max() > 0
+
+
+def test_model_output_that_is_not_finite_ends_in_a_restart():
+    def model(x, u):
+        return torch.where(x[..., :1] > 5, torch.nan, torch_model(x, u))
+
+    config = L1Config(DT, epsilon=0.4)
+    jacobian = ActionJacobian(model)
+    state = init([3], N, M, dtype=torch.float64)
+    x = torch.zeros(3, N, dtype=torch.float64)
+    u_rl = torch.full((3, M), 0.3, dtype=torch.float64)
+    _, state, _ = augment(config, jacobian, state, x, u_rl)
+    x[1, 0] = 6.0
+    u, state, diagnostics = augment(config, jacobian, state, x, u_rl)
+    assert diagnostics.non_finite.squeeze(-1).tolist() == [False, True, False]
+    assert state.started.squeeze(-1).tolist() == [True, False, True]
+    torch.testing.assert_close(u[1], u_rl[1], atol=0, rtol=0)
+    assert all(entry.isfinite().all() for entry in (*state, *diagnostics, u))
+    x[1, 0] = 0.0
+    _, state, diagnostics = augment(config, jacobian, state, x, u_rl)
+    assert state.started.all() and not diagnostics.non_finite.any()
+
+
+@pytest.mark.parametrize(("on_switch", "switch_on", "filter_input"), CHOICES)
+def test_captures_as_one_graph(on_switch, switch_on, filter_input):
+    config = L1Config(
+        DT, epsilon=0.4, on_switch=on_switch, switch_on=switch_on, filter_input=filter_input,
+        a_s=(-1.0, -2.0, -1.0, -0.5), action_low=-1.0, action_high=1.0,
+    )  # fmt: skip
+    model = ActionJacobian(torch_model)
+
+    def run(step):
+        torch.manual_seed(0)
+        state, history = init([3], N, M), []
+        for _ in range(6):
+            x, u_rl = torch.randn(3, N), torch.randn(3, M)
+            with torch.no_grad():
+                u, state, diagnostics = step(state, x, u_rl)
+            history += [u, state.x_hat, diagnostics.switch.float()]
+        return history
+
+    def step(state, x, u_rl):
+        return augment(config, model, state, x, u_rl)
+
+    torch.compiler.reset()
+    captured = torch.compile(step, fullgraph=True, backend="eager")
+    for a, b in zip(run(step), run(captured), strict=True):
+        torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
+
+
+class Counting(EnsembleDynamics):
+    """Counts passes through the network."""
+
+    def __init__(self, *args, **settings):
+        super().__init__(*args, **settings)
+        self.passes = []
+
+    def expansion(self, *args):
+        self.passes.append("expansion")
+        return super().expansion(*args)
+
+    def value_and_jacobian(self, *args):
+        self.passes.append("value_and_jacobian")
+        return super().value_and_jacobian(*args)
+
+    def taylor_remainder(self, *args):
+        self.passes.append("taylor_remainder")
+        return super().taylor_remainder(*args)
+
+    def mean_change(self, *args):
+        self.passes.append("mean_change")
+        return super().mean_change(*args)
+
+
+@pytest.mark.parametrize(("on_switch", "switch_on", "filter_input"), CHOICES)
+@torch.no_grad()
+def test_an_ensemble_is_evaluated_once_and_as_any_other_model(on_switch, switch_on, filter_input):
+    torch.manual_seed(0)
+    model = Counting(N, M, members=3, hidden=(16, 16), activation="silu").double()
+    config = L1Config(
+        DT,
+        epsilon=0.02,
+        on_switch=on_switch,
+        switch_on=switch_on,
+        filter_input=filter_input,
+        action_low=-1.0,
+        action_high=1.0,
+    )
+    # As a function of the two tensors it is differentiated automatically, piece by piece.
+    other = ActionJacobian(lambda x, u: EnsembleDynamics.mean_change(model, x, u))
+    states = [init([5], N, M, dtype=torch.float64)] * 2
+    for _ in range(30):
+        x = torch.randn(5, N, dtype=torch.float64)
+        u_rl = 2 * torch.randn(5, M, dtype=torch.float64)
+        model.passes.clear()
+        results = [
+            augment(config, *both, x, u_rl)
+            for both in zip((ActionJacobian(model), other), states, strict=True)
+        ]
+        # Where the tested input depends on the estimate, that takes a Jacobian first.
+        depends = switch_on == "executed" and filter_input == "current"
+        assert model.passes == ["value_and_jacobian"] * depends + ["expansion"]
+        for found, expected in zip(
+            *((u, *state, *signals) for u, state, signals in results), strict=True
+        ):
+            torch.testing.assert_close(found, expected, atol=1e-11, rtol=1e-9)
+        states = [state for _, state, _ in results]
+    assert 0 < states[0].n_switch.sum() < 150
