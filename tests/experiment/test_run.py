@@ -373,7 +373,7 @@ def test_run_directory_of_a_planner_has_what_is_promised(
     }
     assert torch.load(directory / "model.pt", weights_only=True)
     assert not (directory / "policy.pt").exists(), "a planner has no weights of its own"
-    assert "device cpu, precision float32" in capsys.readouterr().out
+    assert "device cpu, fit float32, precision float32" in capsys.readouterr().out
 
 
 def test_interrupted_planner_goes_on_as_if_it_had_not_been(make: Make, tmp_path: Path) -> None:
