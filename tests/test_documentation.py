@@ -287,8 +287,7 @@ def test_planning_page_has_every_option_and_public_name() -> None:
     assert {name.strip('"') for name in rows} == set(get_args(planning.Precision))
     text = (ROOT / page).read_text()
     names = text[text.index("\n## Public names") :]
-    assert set(planning.__all__) <= words(names) | {"PLAN_KEY"}
-    assert "torchrl_l1.planning.PLAN_KEY" in names
+    assert set(planning.__all__) <= words(names)
 
 
 def test_the_two_controllers_differ_where_the_page_says() -> None:

@@ -146,7 +146,7 @@ def test_a_users_recipe_is_found_beside_the_campaign(write: Any, tmp_path: Path)
         (RUNS.replace("matrix", "overrides: [policy.std=0], matrix"), "policy.std"),
         (RUNS.replace("matrix", "overrides: [threads=0], matrix"), "threads"),
         (RUNS.replace("matrix", "overrides: [perturbation.action_noise=-1], matrix"), "noise"),
-        (RUNS.replace("matrix", "overrides: [device=gpu], matrix"), "device must be cpu or cuda"),
+        (RUNS.replace("matrix", "overrides: [device=gpu], matrix"), "device must be 'cpu'"),
         (RUNS + RUNS.replace("runs: [", "- ").replace("]\n", "\n"), "not valid YAML"),
         (RUNS.replace("runs: [", "runs:\n- ").replace("}}]\n", "}}\n") * 1
          + "- {recipe: metrpo/inverted_pendulum, matrix: {l1: [off]}}", "would share"),
