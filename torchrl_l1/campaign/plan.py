@@ -21,13 +21,14 @@ from torchrl_l1.campaign.description import (
     RunMatrix,
     value_text,
 )
+from torchrl_l1.compilation import check_mode
 from torchrl_l1.envs import get_task
 from torchrl_l1.experiment.errors import USER_ERRORS, RunDirectoryError, message
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import group_setting
-from torchrl_l1.experiment.run import check_mode
+from torchrl_l1.experiment.run import check_wandb_mode
 from torchrl_l1.experiment.run_directory import RunDirectory
-from torchrl_l1.experiment.settings import SCHEMAS, RunSettings, compile_mode, l1_config
+from torchrl_l1.experiment.settings import SCHEMAS, RunSettings, l1_config
 
 
 @dataclass
@@ -200,8 +201,8 @@ def _check(config: DictConfig) -> None:
         )
     get_task(recipe.task)
     l1_config(recipe.l1, recipe.task)
-    compile_mode(recipe.l1.compile)
-    check_mode(recipe.wandb.mode)
+    check_mode(recipe.l1.compile, "l1.compile")
+    check_wandb_mode(recipe.wandb.mode)
 
 
 def check_devices(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:

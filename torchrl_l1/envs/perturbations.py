@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -13,8 +13,27 @@ from torch import Tensor
 from torchrl.envs import Transform
 
 
-class _UniformNoise(Transform):
+class _EnvironmentOnly(Transform):
+    """A transform of environments, with the reason why stored data must not pass it."""
+
+    reason: ClassVar[str]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Refuse to work on stored data.
+
+        Raises:
+            RuntimeError: always.
+        """
+        raise RuntimeError(
+            f"{type(self).__name__} belongs to an environment (TransformedEnv), not to a replay "
+            f"buffer or a policy: {self.reason}"
+        )
+
+
+class _UniformNoise(_EnvironmentOnly):
     """Uniform noise of a given half-width, drawn from torch's global generator."""
+
+    reason = "noise must enter the data once, while they are collected"
 
     def __init__(self, half_width: float, key: NestedKey) -> None:
         super().__init__()
@@ -28,17 +47,6 @@ class _UniformNoise(Transform):
 
     def _noisy(self, value: Tensor) -> Tensor:
         return value + torch.empty_like(value).uniform_(-self.half_width, self.half_width)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Refuse to work on stored data.
-
-        Raises:
-            RuntimeError: always.
-        """
-        raise RuntimeError(
-            f"{type(self).__name__} belongs to an environment (TransformedEnv), not to a replay "
-            "buffer or a policy: noise must enter the data once, while they are collected"
-        )
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(half_width={self.half_width}, key={self.key!r})"
@@ -101,8 +109,10 @@ class ObservationNoise(_UniformNoise):
         return next_tensordict.set(self.key, self._noisy(next_tensordict.get(self.key)))
 
 
-class _ActuatorDisturbance(Transform):
+class _ActuatorDisturbance(_EnvironmentOnly):
     """An elementwise map of the action on its way to the base environment."""
+
+    reason = "it changes what an environment executes"
 
     value: Tensor
 
@@ -131,17 +141,6 @@ class _ActuatorDisturbance(Transform):
                 f"{self.action_key!r} has {action.shape[-1]} entries"
             )
         return tensordict.set(self.action_key, self._disturb(action, self.value.to(action)))
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Refuse to work on stored data.
-
-        Raises:
-            RuntimeError: always.
-        """
-        raise RuntimeError(
-            f"{type(self).__name__} belongs to an environment (TransformedEnv), not to a replay "
-            "buffer or a policy: it changes what an environment executes"
-        )
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.value.tolist()}, key={self.action_key!r})"

@@ -39,7 +39,7 @@ class Tracker:
     def __init__(
         self, mode: str, project: str, config: Mapping[str, Any], directory: Path, run_id: str
     ) -> None:
-        check_mode(mode)
+        check_wandb_mode(mode)
         if mode == "auto":
             # An explicit WANDB_MODE, as users set it on clusters, has the last word.
             mode = os.environ.get("WANDB_MODE") or ("online" if _logged_in() else "offline")
@@ -73,7 +73,7 @@ def _logged_in() -> bool:
         return False
 
 
-def check_mode(mode: str) -> None:
+def check_wandb_mode(mode: str) -> None:
     """Raise a ``ValueError`` for an unknown mode."""
     if mode not in MODES:
         raise ValueError(f"wandb.mode must be one of {', '.join(MODES)}, got {mode!r}")
@@ -97,7 +97,7 @@ def run(config: DictConfig) -> Path:
     recipe = OmegaConf.to_object(config)
     assert isinstance(recipe, RunSettings)
     settings = {str(key): value for key, value in resolved.items()}
-    check_mode(recipe.wandb.mode)
+    check_wandb_mode(recipe.wandb.mode)
     torch.set_num_threads(recipe.threads)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     progress = tqdm(

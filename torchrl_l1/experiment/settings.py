@@ -24,7 +24,7 @@ from torchrl_l1.algorithms import (
 from torchrl_l1.algorithms.algorithm import DEVICES
 from torchrl_l1.algorithms.metrpo_config import check_clipping
 from torchrl_l1.checks import check_choice, check_count, check_optional_count
-from torchrl_l1.compilation import CompileMode, check_mode
+from torchrl_l1.compilation import check_mode
 from torchrl_l1.control import L1Config
 from torchrl_l1.envs import get_task
 
@@ -152,7 +152,7 @@ class RunSettings(ABC):
             seed=self.seed,
             horizon=self.horizon,
             device=self.device,
-            compile_l1=compile_mode(self.l1.compile),
+            compile_l1=check_mode(self.l1.compile, "l1.compile"),
         )
 
 
@@ -197,15 +197,6 @@ def l1_config(settings: L1Settings, task_name: str) -> L1Config | None:
         action_low=task.action_low,
         action_high=task.action_high,
     )
-
-
-def compile_mode(setting: bool | str) -> CompileMode:
-    """Check ``l1.compile``.
-
-    Raises:
-        ValueError: if it is none of true, false and auto.
-    """
-    return check_mode(setting, "l1.compile")
 
 
 # The algorithm's settings come first: they say how many outer iterations there are.
