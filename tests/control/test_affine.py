@@ -124,8 +124,9 @@ def test_agrees_with_algorithm_2(numpy_l1, on_switch, switch_on, filter_input):
             x[2] = rng.normal(size=N)
             fresh = init([batch], N, M, dtype=torch.float64)
             mask = torch.arange(batch).unsqueeze(-1) == 2
+            old = state.entries()
             state = type(state)(
-                *(torch.where(mask, f, s) for f, s in zip(fresh, state, strict=True))
+                **{k: torch.where(mask, f, old[k]) for k, f in fresh.entries().items()}
             )
         u, state, diagnostics = augment(
             config, model, state, torch.as_tensor(x), torch.as_tensor(u_rl)
@@ -181,7 +182,7 @@ def test_model_output_that_is_not_finite_ends_in_a_restart():
     assert diagnostics.non_finite.squeeze(-1).tolist() == [False, True, False]
     assert state.started.squeeze(-1).tolist() == [True, False, True]
     torch.testing.assert_close(u[1], u_rl[1], atol=0, rtol=0)
-    assert all(entry.isfinite().all() for entry in (*state, *diagnostics, u))
+    assert all(entry.isfinite().all() for entry in (*state.entries().values(), *diagnostics, u))
     x[1, 0] = 0.0
     _, state, diagnostics = augment(config, jacobian, state, x, u_rl)
     assert state.started.all() and not diagnostics.non_finite.any()
@@ -267,7 +268,8 @@ def test_an_ensemble_is_evaluated_once_and_as_any_other_model(on_switch, switch_
         depends = switch_on == "executed" and filter_input == "current"
         assert model.passes == ["value_and_jacobian"] * depends + ["expansion"]
         for found, expected in zip(
-            *((u, *state, *signals) for u, state, signals in results), strict=True
+            *((u, *state.entries().values(), *signals) for u, state, signals in results),
+            strict=True,
         ):
             torch.testing.assert_close(found, expected, atol=1e-11, rtol=1e-9)
         states = [state for _, state, _ in results]

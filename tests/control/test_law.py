@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchrl_l1.control import L1Config, L1State, init, step
-from torchrl_l1.control.law import project, respond, saturate, solve_matched
+from torchrl_l1.control.law import project, respond, saturate
+from torchrl_l1.control.least_squares import solve_matched
 
 
 def well_conditioned(rng: np.random.Generator, *shape: int) -> np.ndarray:
@@ -169,16 +170,16 @@ def test_state_does_not_alias_the_inputs(bounded):
     config = L1Config(0.05, **bounds)
     state = started_state(config)
     inputs = random_step(11)
-    before = [value.clone() for value in state]
+    before = [value.clone() for value in state.entries().values()]
     u, following, _ = step(config, state, *inputs)
-    expected = [u.clone(), *(value.clone() for value in following)]
+    expected = [u.clone(), *(value.clone() for value in following.entries().values())]
     for value in inputs:
         value.zero_()
-    for value, old in zip(state, before, strict=True):
+    for value, old in zip(state.entries().values(), before, strict=True):
         torch.testing.assert_close(value, old, atol=0, rtol=0)
     u_rl = inputs[1]
     assert u.data_ptr() != u_rl.data_ptr()
-    for value, old in zip([u, *following], expected, strict=True):
+    for value, old in zip([u, *following.entries().values()], expected, strict=True):
         torch.testing.assert_close(value, old, atol=0, rtol=0)
 
 
@@ -199,7 +200,7 @@ def test_data_that_are_not_finite_stay_in_their_environment(which, value):
     # L1 stands aside and begins again at the next step.
     torch.testing.assert_close(u[1], bad[1][1], equal_nan=True, atol=0, rtol=0)
     assert not following.started[1] and following.started[others].all()
-    for entry in following:
+    for entry in following.entries().values():
         assert entry.isfinite().all()
     for entry in diagnostics:
         assert entry.isfinite().all()

@@ -71,7 +71,7 @@ def test_blocks_of_rows_are_the_batch(batch):
         blocked = step(states[0], x, u_rl)
         assert sum(sizes) == math.prod(batch) and max(sizes) <= BLOCK
         results = (blocked, augment(config, ActionJacobian(model), states[1], x, u_rl))
-        flat = [(u, *state, *signals) for u, state, signals in results]
+        flat = [(u, *state.entries().values(), *signals) for u, state, signals in results]
         for found, expected in zip(*flat, strict=True):
             assert found.shape == expected.shape and found.dtype == expected.dtype
             torch.testing.assert_close(found, expected, atol=1e-6, rtol=1e-5)

@@ -15,7 +15,9 @@ from torchrl_l1.control.affinizer import Affinizer
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.controller import L1Controller
 from torchrl_l1.control.jacobian import ActionJacobian, DynamicsModel
-from torchrl_l1.control.law import L1Diagnostics, L1State, init, solve_matched, step
+from torchrl_l1.control.law import step
+from torchrl_l1.control.least_squares import solve_matched
+from torchrl_l1.control.state import L1Diagnostics, L1State, ResidualStatistics, init
 from torchrl_l1.control.transform import L1Transform
 
 __all__ = [
@@ -29,6 +31,7 @@ __all__ = [
     "L1Diagnostics",
     "L1State",
     "L1Transform",
+    "ResidualStatistics",
     "affinize",
     "augment",
     "init",

@@ -14,7 +14,7 @@ from torchrl_l1.compilation import CompileMode, compiled
 from torchrl_l1.control import law
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import ActionJacobian
-from torchrl_l1.control.law import L1Diagnostics, L1State
+from torchrl_l1.control.state import L1Diagnostics, L1State
 
 BLOCK = 128
 """Rows of a batch that the ensemble evaluates at once on a processor.
@@ -152,7 +152,7 @@ def augment(
     Args:
         config: the settings.
         model: the learned dynamics.
-        state: from :func:`torchrl_l1.control.law.init` or the previous step.
+        state: from :func:`torchrl_l1.control.init` or the previous step.
         observation: ``(..., n)``, raw units.
         u_rl: the policy's action ``(..., m)``; clipped to the bounds first.
 
@@ -160,8 +160,9 @@ def augment(
         the executed input ``(..., m)``, the next state and the diagnostics.
 
     Examples:
+        >>> from torchrl_l1.control import init
         >>> model = ActionJacobian(lambda x, u: -0.1 * x + 0.2 * u.sin())
-        >>> state = law.init([3], observation_dim=1, action_dim=1)
+        >>> state = init([3], observation_dim=1, action_dim=1)
         >>> config = L1Config(0.05, epsilon=0.1)
         >>> u, state, diagnostics = augment(
         ...     config, model, state, torch.ones(3, 1), torch.zeros(3, 1)
@@ -181,6 +182,8 @@ def augment_silently(
     u_rl: Tensor,
 ) -> tuple[Tensor, L1State, Callable[[], L1Diagnostics]]:
     """:func:`augment` with the diagnostics as a function, which need not be called."""
+    if config.filter == "kalman":
+        return _augment_kalman(config, model, state, observation, u_rl)
     u_rl = law.saturate(config, u_rl)
     u_bar = torch.where(state.started, state.u_bar, u_rl)
     tested = _tested_input(config, model, state, observation, u_rl, u_bar)
@@ -189,14 +192,57 @@ def augment_silently(
     )
     u_bar, change, jacobian = affinization
     restart = switch if config.on_switch == "reset" else None
+    residuals = None
+    if config.estimator == "weighted":
+        residuals = model.residual_statistics(observation, u_bar, config.covariance)
     u, following, terms = law.respond(
-        config, state, observation, u_rl, change, jacobian, u_bar, restart
+        config, state, observation, u_rl, change, jacobian, u_bar, restart, residuals
     )
     following = following._replace(
         u_bar=u_bar.masked_fill(terms.non_finite, 0.0), n_switch=state.n_switch + switch
     )
 
     def diagnostics() -> L1Diagnostics:
+        counted = error.masked_fill(terms.non_finite | ~state.started, 0.0)
+        return law.diagnose(config, terms, switch, counted)
+
+    return u, following, diagnostics
+
+
+def _augment_kalman(
+    config: L1Config,
+    model: ActionJacobian,
+    state: L1State,
+    observation: Tensor,
+    u_rl: Tensor,
+) -> tuple[Tensor, L1State, Callable[[], L1Diagnostics]]:
+    """As :func:`augment_silently`: here the input is known before the model is evaluated."""
+    u_rl = law.saturate(config, u_rl)
+    # What the last step expected does not depend on where this one is.
+    known = model.residual_statistics(observation, u_rl, "residuals")
+    estimated = law.estimate(config, state, observation, known)
+    u = law.adapted(config, estimated, u_rl)
+    if config.epsilon == 0:
+        switch, error = state.started, None
+        u_bar, change, jacobian = affinize(model, observation, u)
+    else:
+        u_bar = torch.where(state.started, state.u_bar, u)
+        switch, error, (u_bar, change, jacobian) = operating_point(
+            model, observation, u_bar, u, u, state.started, config.epsilon
+        )
+    residuals = known
+    if config.covariance != "residuals":
+        residuals = model.residual_statistics(observation, u, config.covariance)
+    u, following, terms = law.follow(
+        config, state, estimated, observation, u_rl, change, jacobian, u_bar, residuals
+    )
+    following = following._replace(
+        u_bar=u_bar.masked_fill(terms.non_finite, 0.0), n_switch=state.n_switch + switch
+    )
+
+    def diagnostics() -> L1Diagnostics:
+        if error is None:
+            return law.diagnose(config, terms, switch)
         counted = error.masked_fill(terms.non_finite | ~state.started, 0.0)
         return law.diagnose(config, terms, switch, counted)
 
@@ -247,15 +293,21 @@ def _in_blocks(step: StepFunction, state: L1State, observation: Tensor, u_rl: Te
     batch = observation.shape[:-1]
     if batch.numel() <= BLOCK or observation.device.type != "cpu":
         return step(state, observation, u_rl)
-    rows = (x.reshape(-1, x.shape[-1]).split(BLOCK) for x in (*state, observation, u_rl))
-    steps = [step(L1State(*x[:-2]), *x[-2:]) for x in zip(*rows, strict=True)]
+    names = list(state.entries())
+    entries = (*state.entries().values(), observation, u_rl)
+    rows = (x.reshape(-1, x.shape[-1]).split(BLOCK) for x in entries)
+    steps = [
+        step(L1State(**dict(zip(names, x[:-2], strict=True))), *x[-2:])
+        for x in zip(*rows, strict=True)
+    ]
 
     def joined(parts: tuple[Tensor, ...]) -> Tensor:
         return torch.cat(parts).reshape(*batch, -1)
 
     executed, states, signals = zip(*steps, strict=True)
+    following = zip(*(list(x.entries().values()) for x in states), strict=True)
     return (
         joined(executed),
-        L1State(*map(joined, zip(*states, strict=True))),
+        L1State(**dict(zip(names, map(joined, following), strict=True))),
         None if signals[0] is None else L1Diagnostics(*map(joined, zip(*signals, strict=True))),
     )

@@ -12,7 +12,15 @@ from torchrl_l1.checks import check_choice
 OnSwitch = Literal["keep", "reset"]
 SwitchOn = Literal["policy", "executed"]
 FilterInput = Literal["current", "previous"]
+Estimator = Literal["least_squares", "weighted"]
+Filter = Literal["low_pass", "kalman"]
+Covariance = Literal["residuals", "heads", "disagreement", "sum"]
 Scalars = float | tuple[float, ...]
+
+_NUMBERS = (
+    *("dt", "epsilon", "cutoff", "alpha", "dead_zone", "process_noise", "inflation"),
+    *("initial_deviation", "forgetting"),
+)
 
 DEFAULT_ALPHA = 0.35
 """Filter gain per step when neither ``alpha`` nor ``cutoff`` is given: cutoff = 0.35 / dt."""
@@ -21,6 +29,9 @@ _CHOICES = {
     "on_switch": get_args(OnSwitch),
     "switch_on": get_args(SwitchOn),
     "filter_input": get_args(FilterInput),
+    "estimator": get_args(Estimator),
+    "filter": get_args(Filter),
+    "covariance": get_args(Covariance),
 }
 
 
@@ -54,6 +65,28 @@ class L1Config:
             finite. No action cancels a larger matched disturbance, and where the actions have
             almost no effect the estimate has no bound of its own. The predictor takes in the
             whole estimate either way.
+        estimator: ``"least_squares"`` in raw state units, as in the paper, or ``"weighted"`` by
+            the covariance of the model's one-step residuals (generalised least squares).
+        filter: what turns the estimates of single steps into the adaptive input: the paper's
+            ``"low_pass"`` filter, or a ``"kalman"`` filter, whose state is the matched
+            disturbance as a random walk, see :mod:`torchrl_l1.control.kalman`. The latter weighs
+            each step by how well the actions can be seen in it and acts on what is significant;
+            it needs no ``cutoff``, ``alpha``, ``a_s`` or ``filter_input``, and is kept at
+            switches.
+        covariance: the covariance of the residuals that both use: of the model's validation
+            ``"residuals"``, or of the model at each state and action, from its ``"heads"``, the
+            ``"disagreement"`` of its members or the ``"sum"`` of all three.
+        dead_zone: posterior standard deviations of the disturbance within which the Kalman
+            filter's estimate is not acted on; 0 acts on all of it.
+        process_noise: standard deviation of the disturbance's change per step, as a fraction
+            of half the range of the action (of one action unit without bounds). If ``None``, what
+            the model's calibration found, or else 0.003.
+        inflation: factor on the covariance, since residuals are neither white nor normal. If
+            ``None``, what the model's calibration found, or else 1.
+        initial_deviation: standard deviation of the disturbance at a reset, in the units of
+            ``process_noise``.
+        forgetting: factor per step of the running estimate of how noisy each state is, which
+            notices a sensor that has become noisy; 1 does without.
 
     Raises:
         ValueError: for a setting out of its domain, or settings that exclude each other.
@@ -79,9 +112,17 @@ class L1Config:
     action_low: Scalars | None = None
     action_high: Scalars | None = None
     project: bool = True
+    estimator: Estimator = "least_squares"
+    filter: Filter = "low_pass"
+    covariance: Covariance = "residuals"
+    dead_zone: float = 2.0
+    process_noise: float | None = None
+    inflation: float | None = None
+    initial_deviation: float = 0.3
+    forgetting: float = 0.97
 
     def __post_init__(self) -> None:
-        for name in ("dt", "epsilon", "cutoff", "alpha"):
+        for name in _NUMBERS:
             value = getattr(self, name)
             if value is not None and not (_is_real(value) and math.isfinite(value)):
                 raise ValueError(f"{name} must be a finite number, got {value!r}")
@@ -96,6 +137,7 @@ class L1Config:
         if not isinstance(self.project, bool):
             raise ValueError(f"project must be True or False, got {self.project!r}")
         self._check_filter()
+        self._check_kalman()
         self._check_predictor()
         self._check_bounds()
 
@@ -108,6 +150,27 @@ class L1Config:
         if not 0 <= self.filter_gain <= 1:
             source = "alpha" if self.cutoff is None else "cutoff * dt"
             raise ValueError(f"{source} must lie in [0, 1], got {self.filter_gain}")
+
+    def _check_kalman(self) -> None:
+        if self.dead_zone < 0:
+            raise ValueError(f"dead_zone must not be negative, got {self.dead_zone}")
+        if self.process_noise is not None and self.process_noise < 0:
+            raise ValueError(f"process_noise must not be negative, got {self.process_noise}")
+        if self.inflation is not None and self.inflation <= 0:
+            raise ValueError(f"inflation must be positive, got {self.inflation}")
+        if self.initial_deviation <= 0:
+            raise ValueError(f"initial_deviation must be positive, got {self.initial_deviation}")
+        if not 0 < self.forgetting <= 1:
+            raise ValueError(f"forgetting must lie in (0, 1], got {self.forgetting}")
+        if self.filter != "kalman":
+            return
+        if self.cutoff is not None or self.alpha is not None:
+            raise ValueError(
+                "cutoff and alpha belong to the low-pass filter: leave them out with "
+                "filter='kalman', whose bandwidth follows from process_noise"
+            )
+        if self.on_switch == "reset":
+            raise ValueError("filter='kalman' is kept at switches: leave on_switch at 'keep'")
 
     def _check_predictor(self) -> None:
         for rate in _tuple(self.a_s):
@@ -156,6 +219,16 @@ class L1Config:
         }
         return cls(dt, epsilon=epsilon, **(reference | settings))
 
+    @classmethod
+    def robust(cls, dt: float, *, epsilon: float = 0.0, **settings: Any) -> L1Config:
+        """Kalman filter on covariance-weighted residuals, acting on what is significant.
+
+        Not in the paper: it answers its open question about the covariance of probabilistic
+        models. With ``epsilon`` 0 the affine model sits at the executed input in every step.
+        """
+        robust: dict[str, Any] = {"estimator": "weighted", "filter": "kalman"}
+        return cls(dt, epsilon=epsilon, **(robust | settings))
+
     @property
     def filter_gain(self) -> float:
         r"""Gain :math:`\alpha = \omega T_s` of the discrete low-pass filter."""
@@ -177,6 +250,15 @@ class L1Config:
             return tuple(b - a for a, b in zip(low, high, strict=True))
         # The configuration expands a number beside a tuple, so both are numbers here.
         return _tuple(high)[0] - _tuple(low)[0]
+
+    @property
+    def half_range(self) -> Scalars:
+        """Half the range of the action, one where a bound is missing; action units."""
+        if self.action_low is None or self.action_high is None:
+            return 1.0
+        pairs = zip(_tuple(self.action_low), _tuple(self.action_high), strict=True)
+        halves = tuple(0.5 * (b - a) if math.isfinite(b - a) else 1.0 for a, b in pairs)
+        return halves if isinstance(self.action_low, tuple) else halves[0]
 
     @property
     def adaptation_gain(self) -> Scalars:

@@ -15,7 +15,6 @@ from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control.affine import make_step
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import Predicts
-from torchrl_l1.control.law import L1State
 from torchrl_l1.control.layout import (
     L1_KEY,
     Dynamics,
@@ -24,6 +23,7 @@ from torchrl_l1.control.layout import (
     as_action_jacobian,
     declared_dimension,
 )
+from torchrl_l1.control.state import state_names
 
 
 class L1Controller(TensorDictModuleBase):
@@ -32,7 +32,7 @@ class L1Controller(TensorDictModuleBase):
     Reads the observation, the actor's action and the controller's state; replaces the action
     by the executed input, keeps the actor's under ``(key, "u_rl")`` and writes the next state,
     the executed input ``u_exec`` and the diagnostics
-    (:class:`~torchrl_l1.control.law.L1Diagnostics`) under ``("next", key)``. The environment
+    (:class:`~torchrl_l1.control.L1Diagnostics`) under ``("next", key)``. The environment
     needs the primer of :meth:`make_primer`, which starts the state at each reset and carries
     it from step to step. No gradient flows through the controller: log-probabilities belong
     to ``(key, "u_rl")``.
@@ -104,9 +104,10 @@ class L1Controller(TensorDictModuleBase):
             declared_dimension(self.model, "observation_dim", observation_dim),
             declared_dimension(self.model, "action_dim", action_dim),
         )
-        self.in_keys = [observation_key, action_key, *((key, name) for name in L1State._fields)]
+        self._state_names = state_names(config)
+        self.in_keys = [observation_key, action_key, *((key, name) for name in self._state_names)]
         self.out_keys = [action_key, (key, "u_rl")]
-        self.out_keys += [("next", key, name) for name in (*L1State._fields, "u_exec")]
+        self.out_keys += [("next", key, name) for name in (*self._state_names, "u_exec")]
         self._step = make_step(config, self.model, compile, diagnostics)
 
     def make_primer(self) -> TensorDictPrimer:
@@ -120,7 +121,9 @@ class L1Controller(TensorDictModuleBase):
         self.config.check_dimensions(observation_dim, action_dim)
         dtype = self.model.dtype or torch.get_default_dtype()
         layout = Layout(torch.Size([]), observation_dim, action_dim, dtype, dtype)
-        return TensorDictPrimer(Composite({self.key: layout.state_spec()}), expand_specs=True)
+        return TensorDictPrimer(
+            Composite({self.key: layout.state_spec(self.config)}), expand_specs=True
+        )
 
     # The name under which torchrl.modules.utils.get_primers_from_module looks for it.
     make_tensordict_primer = make_primer
@@ -129,6 +132,7 @@ class L1Controller(TensorDictModuleBase):
         """One step of the controller, see the class."""
         u_rl, executed, following = advance(
             self._step,
+            self._state_names,
             tensordict,
             self.observation_key,
             self.action_key,

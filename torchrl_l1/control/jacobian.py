@@ -12,6 +12,8 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
+from torchrl_l1.control.state import ResidualStatistics
+
 Predicts = Literal["change", "next_observation"]
 ChangeFunction = Callable[[Tensor, Tensor], Tensor]
 Expansion = tuple[Tensor, Callable[[Tensor], tuple[Tensor, Tensor]]]
@@ -180,6 +182,29 @@ class ActionJacobian:
                 lambda u: self.value(observation, u), (u_bar,), (step,)
             )
         return self.value(observation, action) - value - slope
+
+    def residual_statistics(
+        self, observation: Tensor, action: Tensor, source: str = "residuals"
+    ) -> ResidualStatistics:
+        """What the model knows of its one-step residuals.
+
+        Args:
+            observation: ``(..., n)``, raw units.
+            action: ``(..., m)``, raw units.
+            source: one of :attr:`L1Config.covariance`'s.
+
+        Returns:
+            those of the model's ``residual_statistics``; else the covariance that its
+            ``residual_covariance`` gives; else that of white residuals of unit variance.
+        """
+        known = getattr(self.dynamics, "residual_statistics", None)
+        if callable(known):
+            return known(observation, action, source)
+        covariance = getattr(self.dynamics, "residual_covariance", None)
+        if callable(covariance):
+            return ResidualStatistics(covariance(observation, action))
+        eye = torch.eye(observation.shape[-1], dtype=observation.dtype, device=observation.device)
+        return ResidualStatistics(eye)
 
     @property
     def blockwise(self) -> bool:

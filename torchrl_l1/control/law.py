@@ -2,88 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchrl_l1.control import kalman
 from torchrl_l1.control.config import L1Config, Scalars
-
-
-class L1State(NamedTuple):
-    """What the controller remembers from one step to the next.
-
-    Attributes:
-        x_hat: predicted observation ``(..., n)``.
-        u_bar: operating point of the affine model ``(..., m)``.
-        q: filter state ``(..., m)``; the adaptive input is ``-q``.
-        sigma_m: matched uncertainty estimated at the last step ``(..., m)``, action units,
-            projected if the configuration asks for it.
-        n_switch: switches since the reset ``(..., 1)``, int64.
-        started: whether the other entries mean anything ``(..., 1)``, bool.
-    """
-
-    x_hat: Tensor
-    u_bar: Tensor
-    q: Tensor
-    sigma_m: Tensor
-    n_switch: Tensor
-    started: Tensor
-
-
-class L1Diagnostics(NamedTuple):
-    """Signals of one step, each ``(..., 1)``; norms are Euclidean.
-
-    Attributes:
-        switch: the operating point moved (bool).
-        affinization_error: error of the affine model at the tested input, state units.
-        prediction_error: norm of the state prediction error, state units.
-        matched: norm of the matched part of the uncertainty estimate, state units per second.
-        unmatched: norm of the part that no action can cancel, state units per second.
-        u_a: norm of the adaptive input before saturation, action units.
-        saturation: fraction of the action's entries that a bound cut.
-        ill_conditioned: the matched part came from damped least squares (bool).
-        non_finite: an input was not finite: L1 stood aside and restarts (bool).
-    """
-
-    switch: Tensor
-    affinization_error: Tensor
-    prediction_error: Tensor
-    matched: Tensor
-    unmatched: Tensor
-    u_a: Tensor
-    saturation: Tensor
-    ill_conditioned: Tensor
-    non_finite: Tensor
-
-
-def init(
-    batch_size: Sequence[int],
-    observation_dim: int,
-    action_dim: int,
-    *,
-    dtype: torch.dtype | None = None,
-    device: torch.device | str | None = None,
-) -> L1State:
-    """State before the first step: zeros, not started.
-
-    Examples:
-        >>> init([5], observation_dim=4, action_dim=1).x_hat.shape
-        torch.Size([5, 4])
-    """
-
-    def zeros(width: int, dtype: torch.dtype | None) -> Tensor:
-        return torch.zeros(*batch_size, width, dtype=dtype, device=device)
-
-    return L1State(
-        x_hat=zeros(observation_dim, dtype),
-        u_bar=zeros(action_dim, dtype),
-        q=zeros(action_dim, dtype),
-        sigma_m=zeros(action_dim, dtype),
-        n_switch=zeros(1, torch.int64),
-        started=zeros(1, torch.bool),
-    )
+from torchrl_l1.control.kalman import Posterior
+from torchrl_l1.control.least_squares import is_finite, solve_matched, whitened
+from torchrl_l1.control.state import L1Diagnostics, L1State, ResidualStatistics
 
 
 def saturate(config: L1Config, action: Tensor) -> Tensor:
@@ -131,6 +59,7 @@ def step(
     drift: Tensor,
     jacobian: Tensor,
     restart: Tensor | None = None,
+    residuals: ResidualStatistics | None = None,
 ) -> tuple[Tensor, L1State, L1Diagnostics]:
     r"""One step of the L1 adaptive controller on the affine model ``x' = x + drift + jacobian u``.
 
@@ -156,6 +85,8 @@ def step(
     of an environment is not finite the output is ``u_rl``, ``non_finite`` is set and that
     environment restarts at its next step; the others are not touched.
 
+    With ``filter="kalman"`` the step is that of :func:`estimate` and :func:`follow` instead.
+
     Args:
         config: the settings; switching fields other than the filter's are not used here.
         state: from :func:`init` or the previous step.
@@ -164,6 +95,7 @@ def step(
         drift: ``(..., n)``, state units per step.
         jacobian: ``(..., n, m)``, state units per step and action unit.
         restart: ``(..., 1)`` bool, where predictor and filter start afresh before this step.
+        residuals: what is known of the residuals; white ones of unit variance if ``None``.
 
     Returns:
         the executed input ``(..., m)``, the next state and the diagnostics (the two of the
@@ -182,9 +114,17 @@ def step(
         >>> state.x_hat[0]
         tensor([0.5000, 0.5000, 0.5000])
     """
-    u, following, terms = respond(
-        config, state, observation, saturate(config, u_rl), drift, jacobian, restart=restart
-    )
+    u_rl = saturate(config, u_rl)
+    _check_shapes(state, observation, u_rl, drift, "drift", jacobian, restart)
+    if config.filter == "kalman":
+        estimated = estimate(config, state, observation, residuals, restart)
+        u, following, terms = follow(
+            config, state, estimated, observation, u_rl, drift, jacobian, residuals=residuals
+        )
+    else:
+        u, following, terms = respond(
+            config, state, observation, u_rl, drift, jacobian, None, restart, residuals
+        )
     return u, following, diagnose(config, terms, restart)
 
 
@@ -197,8 +137,9 @@ class Terms(NamedTuple):
         effect_matched: its part that an action could cancel ``(..., n)``.
         q: next filter state ``(..., m)``.
         cut: entries of the action that a bound cut ``(..., m)``, bool.
-        ill_conditioned: see :func:`solve_matched`.
+        ill_conditioned: see :func:`~torchrl_l1.control.solve_matched`.
         non_finite: an input was not finite ``(..., 1)``, bool.
+        posterior: of the matched disturbance, with a Kalman filter.
     """
 
     x_err: Tensor
@@ -208,6 +149,7 @@ class Terms(NamedTuple):
     cut: Tensor
     ill_conditioned: Tensor
     non_finite: Tensor
+    posterior: Posterior | None = None
 
 
 def respond(
@@ -219,6 +161,7 @@ def respond(
     jacobian: Tensor,
     u_bar: Tensor | None = None,
     restart: Tensor | None = None,
+    residuals: ResidualStatistics | None = None,
 ) -> tuple[Tensor, L1State, Terms]:
     """:func:`step` without its diagnostics, on ``x' = x + change + jacobian (u - u_bar)``.
 
@@ -231,14 +174,13 @@ def respond(
         jacobian: as in :func:`step`.
         u_bar: operating point ``(..., m)``; zero if ``None``.
         restart: as in :func:`step`.
+        residuals: as in :func:`step`.
 
     Returns:
         the executed input, the next state (but for what a switch changes) and what
         :func:`diagnose` needs.
     """
-    # The change at zero is the drift of :func:`step`.
-    name = "drift" if u_bar is None else "change"
-    _check_shapes(state, observation, u_rl, change, name, jacobian, restart)
+    _check_shapes(state, observation, u_rl, change, "change", jacobian, restart)
     fresh = ~state.started if restart is None else ~state.started | restart
     x_hat = torch.where(fresh, observation, state.x_hat)
 
@@ -246,7 +188,11 @@ def respond(
     # step here: this is T sigma_hat, so that no division by a small T enters the state.
     x_err = x_hat - observation
     estimate = x_err * -_like(x_err, config.adaptation_gain)
-    matched, ill_conditioned = solve_matched(jacobian, estimate)
+    columns, residual = jacobian, estimate
+    if config.estimator == "weighted" and residuals is not None:
+        columns, white = whitened(residuals.covariance, jacobian, estimate.unsqueeze(-1))
+        residual = white.squeeze(-1)
+    matched, ill_conditioned = solve_matched(columns, residual)
     sigma_m = project(config, matched)
 
     # Control input.
@@ -262,7 +208,7 @@ def respond(
     effect_u, effect_matched = (jacobian @ torch.stack([step_u, matched], dim=-1)).unbind(-1)
     x_hat = x_hat + change + effect_u - x_err * _like(x_err, config.predictor_gain)
 
-    finite = _is_finite(x_hat)
+    finite = is_finite(x_hat)
     non_finite = ~finite
     # The least squares gives finite numbers whatever it gets, so q and sigma_m need no care.
     following = L1State(
@@ -277,10 +223,203 @@ def respond(
     return torch.where(finite, u, u_rl), following, terms
 
 
-def _is_finite(vector: Tensor) -> Tensor:
-    """Whether a vector's sum is finite: ``(..., d)`` to ``(..., 1)``, in half of the kernels."""
-    total = vector.sum(-1, keepdim=True)
-    return total - total == 0
+class Estimate(NamedTuple):
+    """What the Kalman filter knows before it says what to do.
+
+    Attributes:
+        posterior: of the matched disturbance; zero where it is not finite.
+        noise: running ratios of the residuals' squares to those expected ``(..., n)``.
+        innovation: what the prediction missed ``(..., n)``, state units.
+        residual: what the model missed ``(..., n)``: the innovation and what was expected of
+            the disturbance.
+        effect_matched: what of it the posterior explains ``(..., n)``.
+        finite: whether all of this is finite ``(..., 1)``, bool.
+    """
+
+    posterior: Posterior
+    noise: Tensor
+    innovation: Tensor
+    residual: Tensor
+    effect_matched: Tensor
+    finite: Tensor
+
+
+def estimate(
+    config: L1Config,
+    state: L1State,
+    observation: Tensor,
+    residuals: ResidualStatistics | None = None,
+    restart: Tensor | None = None,
+) -> Estimate:
+    r"""What the observation tells of the matched disturbance: one step of a Kalman filter.
+
+    The disturbance :math:`d` is a random walk, seen through the last step's Jacobian in the
+    model's residual:
+
+    .. math::
+
+        d_t = d_{t-1} + \nu_t, \quad \nu_t \sim N(0, q^2 I), \qquad
+        x_t - x_{t-1} - \hat f(x_{t-1}, u_{t-1}) = J_{t-1} d_t + w_t, \quad
+        w_t \sim N(0, D_t \Lambda D_t)
+
+    with :math:`\Lambda` the inflated covariance of the residuals. The squares of the diagonal
+    :math:`D_t`, never below one, are a running mean of :func:`~.kalman.noise_ratio`: a state
+    whose sensor has become noisy loses its weight.
+
+    Args:
+        config: the settings.
+        state: from :func:`~torchrl_l1.control.init` with these settings, or the previous step.
+        observation: ``(..., n)``, raw units.
+        residuals: as in :func:`step`.
+        restart: as in :func:`step`.
+
+    Returns:
+        the posterior and what led to it.
+    """
+    assert state.covariance is not None and state.noise is not None and state.jacobian is not None
+    n, m = observation.shape[-1], state.q.shape[-1]
+    fresh = ~state.started if restart is None else ~state.started | restart
+    statistics = _unit(observation) if residuals is None else residuals
+    half_range = _vector(observation, config.half_range, m)
+    process_noise = half_range * _chosen(config.process_noise, statistics.process_noise)
+    initial = torch.diag_embed((half_range * config.initial_deviation).square())
+    prior = Posterior(
+        state.sigma_m.masked_fill(fresh, 0.0),
+        torch.where(
+            fresh.unsqueeze(-1),
+            initial,
+            kalman.time_update(state.covariance.unflatten(-1, (m, m)), process_noise),
+        ),
+    )
+    jacobian = state.jacobian.masked_fill(fresh, 0.0).unflatten(-1, (n, m))
+    innovation = (observation - state.x_hat).masked_fill(fresh, 0.0)
+    expected = (jacobian @ prior.mean.unsqueeze(-1)).squeeze(-1)
+    residual = innovation + expected
+
+    covariance = _expected_covariance(config, state, statistics, fresh)
+    noise = state.noise.masked_fill(fresh, 1.0)
+    scale = noise.clamp_min(1.0).sqrt().unsqueeze(-1)
+    columns, white = whitened(covariance, jacobian / scale, innovation.unsqueeze(-1) / scale)
+    posterior = kalman.measurement_update(prior, columns, white.squeeze(-1))
+    if config.forgetting < 1:
+        left = residual - (jacobian @ posterior.mean.unsqueeze(-1)).squeeze(-1)
+        ratio = kalman.noise_ratio(covariance, jacobian, posterior, left)
+        noise = torch.where(fresh, noise, torch.lerp(ratio, noise, config.forgetting))
+
+    flat = posterior.covariance.flatten(-2)
+    finite = is_finite(torch.cat([observation, posterior.mean, flat, noise], -1))
+    posterior = Posterior(
+        project(config, posterior.mean.masked_fill(~finite, 0.0)),
+        posterior.covariance.masked_fill(~finite.unsqueeze(-1), 0.0),
+    )
+    effect = (jacobian @ posterior.mean.unsqueeze(-1)).squeeze(-1)
+    return Estimate(posterior, noise, innovation, residual, effect, finite)
+
+
+def adapted(config: L1Config, estimated: Estimate, u_rl: Tensor) -> Tensor:
+    """The input that cancels what of an estimate is significant, within the bounds."""
+    return saturate(config, u_rl - kalman.significant(estimated.posterior, config.dead_zone))
+
+
+def follow(
+    config: L1Config,
+    state: L1State,
+    estimated: Estimate,
+    observation: Tensor,
+    u_rl: Tensor,
+    change: Tensor,
+    jacobian: Tensor,
+    u_bar: Tensor | None = None,
+    residuals: ResidualStatistics | None = None,
+) -> tuple[Tensor, L1State, Terms]:
+    """The input, the next state and the terms of the diagnostics after :func:`estimate`.
+
+    Args:
+        config: the settings.
+        state: that the estimate was made of.
+        estimated: the estimate.
+        observation: as in :func:`step`.
+        u_rl: the policy's action within its bounds ``(..., m)``.
+        change: of the model at ``u_bar`` ``(..., n)``, state units per step.
+        jacobian: as in :func:`step`.
+        u_bar: operating point ``(..., m)``; zero if ``None``.
+        residuals: as in :func:`step`, at this step's input where they depend on it.
+
+    Returns:
+        as :func:`respond`.
+    """
+    posterior = estimated.posterior
+    q = kalman.significant(posterior, config.dead_zone)
+    unbounded = u_rl - q
+    u = saturate(config, unbounded)
+    step_u = (u if u_bar is None else u - u_bar) + posterior.mean
+    x_hat = observation + change + (jacobian @ step_u.unsqueeze(-1)).squeeze(-1)
+
+    finite = estimated.finite & is_finite(x_hat) & is_finite(jacobian.flatten(-2))
+    non_finite = ~finite
+    assert state.covariance is not None
+    following = L1State(
+        x_hat=x_hat.masked_fill(non_finite, 0.0),
+        u_bar=state.u_bar,
+        q=q,
+        sigma_m=posterior.mean,
+        n_switch=state.n_switch,
+        started=finite,
+        covariance=posterior.covariance.flatten(-2),
+        noise=estimated.noise.masked_fill(non_finite, 1.0),
+        jacobian=jacobian.flatten(-2).masked_fill(non_finite, 0.0),
+        residual_covariance=_remembered(state, residuals, non_finite),
+    )
+    terms = Terms(
+        -estimated.innovation,
+        estimated.residual,
+        estimated.effect_matched,
+        q,
+        u != unbounded,
+        torch.zeros_like(finite),
+        non_finite,
+        posterior,
+    )
+    return torch.where(finite, u, u_rl), following, terms
+
+
+def _expected_covariance(
+    config: L1Config, state: L1State, residuals: ResidualStatistics, fresh: Tensor
+) -> Tensor:
+    """Of the residual just seen ``(n, n)`` or ``(..., n, n)``."""
+    covariance = residuals.covariance
+    if state.residual_covariance is not None:
+        n = state.x_hat.shape[-1]
+        remembered = state.residual_covariance.unflatten(-1, (n, n))
+        eye = torch.eye(n, dtype=remembered.dtype, device=remembered.device)
+        covariance = torch.where(fresh.unsqueeze(-1), eye, remembered)
+    if config.estimator == "least_squares":
+        mean = covariance.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
+        covariance = mean * torch.eye(covariance.shape[-1], dtype=mean.dtype, device=mean.device)
+    return covariance * _chosen(config.inflation, residuals.inflation)
+
+
+def _remembered(
+    state: L1State, residuals: ResidualStatistics | None, non_finite: Tensor
+) -> Tensor | None:
+    if state.residual_covariance is None:
+        return None
+    assert residuals is not None, "a covariance that depends on state and action must be given"
+    shape = state.residual_covariance.shape
+    return residuals.covariance.flatten(-2).expand(shape).masked_fill(non_finite, 0.0)
+
+
+def _unit(observation: Tensor) -> ResidualStatistics:
+    n = observation.shape[-1]
+    return ResidualStatistics(torch.eye(n, dtype=observation.dtype, device=observation.device))
+
+
+def _chosen(setting: float | None, measured: Tensor | float) -> Tensor | float:
+    return measured if setting is None else setting
+
+
+def _vector(like: Tensor, value: Scalars, width: int) -> Tensor:
+    return torch.as_tensor(value, dtype=like.dtype, device=like.device).expand(width)
 
 
 def diagnose(
@@ -290,7 +429,7 @@ def diagnose(
     affinization_error: Tensor | None = None,
 ) -> L1Diagnostics:
     """The diagnostics of a step, with those of the switching law if they are given."""
-    x_err, estimate, effect_matched, q, cut, ill_conditioned, non_finite = terms
+    x_err, estimate, effect_matched, q, cut, ill_conditioned, non_finite, posterior = terms
     norms = torch.linalg.vector_norm(
         torch.stack([x_err, effect_matched, estimate - effect_matched], dim=-2), dim=-1
     )
@@ -307,7 +446,20 @@ def diagnose(
         saturation=(cut & ~non_finite).to(q.dtype).mean(-1, keepdim=True),
         ill_conditioned=ill_conditioned,
         non_finite=non_finite,
+        **_significance(posterior, prediction_error),
     )
+
+
+def _significance(posterior: Posterior | None, like: Tensor) -> dict[str, Tensor]:
+    if posterior is None:
+        zero = torch.zeros_like(like)
+        return {"posterior_deviation": zero, "significance": zero}
+    deviation = posterior.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    tiny = torch.finfo(deviation.dtype).tiny
+    return {
+        "posterior_deviation": torch.linalg.vector_norm(deviation, dim=-1, keepdim=True),
+        "significance": (posterior.mean.abs() / deviation.clamp_min(tiny)).amax(-1, keepdim=True),
+    }
 
 
 def _check_shapes(
@@ -339,89 +491,3 @@ def _like(tensor: Tensor, value: Scalars) -> Tensor | float:
     if isinstance(value, tuple):
         return torch.tensor(value, dtype=tensor.dtype, device=tensor.device)
     return value
-
-
-RANK_TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
-"""Smallest squared pivot of the scaled normal equations that counts as full rank, by dtype.
-
-A squared pivot is one minus the squared multiple correlation of a column with those before it,
-so columns within about 0.2 degrees (float32) or 0.0006 degrees (float64) of dependence, and no
-others, are flagged.
-"""
-
-DAMPING = 1e-3
-"""Levenberg damping of flagged systems, relative to columns of unit length.
-
-It bounds the gain along a nearly dependent direction to 16 per unit column and biases the
-remaining directions by about 0.1 percent.
-"""
-
-_SMALLEST_RELATIVE_COLUMN = 1e-3
-"""Columns are scaled to unit length, but by no more than this times the longest column.
-
-Undamped least squares does not depend on the scaling. Shorter columns lose pivot, so that an
-action without effect is flagged instead of being given an enormous estimate.
-"""
-
-
-def solve_matched(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Least-squares solution of ``jacobian @ x = residual``, damped where that is ill posed.
-
-    Column-equilibrated normal equations by Cholesky decomposition: for tall, thin Jacobians
-    this is the cheapest batched solver, raises nothing and compiles. One action has a closed
-    form.
-
-    Args:
-        jacobian: ``(..., n, m)``.
-        residual: ``(..., n)``.
-
-    Returns:
-        the solution ``(..., m)``, always finite, and flags ``(..., 1)``, true where the
-        Jacobian is rank deficient, ill conditioned (see :data:`RANK_TOLERANCE`) or not finite.
-        A Jacobian or residual that is not finite gives zeros.
-
-    Examples:
-        >>> jacobian = torch.tensor([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]])
-        >>> solution, flagged = solve_matched(jacobian, torch.tensor([3.0, 4.0, 5.0]))
-        >>> solution, flagged
-        (tensor([3., 2.]), tensor([False]))
-    """
-    if jacobian.shape[-1] == 1:
-        solution, ill_conditioned = _solve_one_column(jacobian, residual)
-        return torch.where(solution.isfinite(), solution, 0.0), ill_conditioned
-    solution, ill_conditioned = _solve_columns(jacobian, residual)
-    return solution.masked_fill(~_is_finite(solution), 0.0), ill_conditioned
-
-
-def _solve_one_column(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
-    column = jacobian.squeeze(-1)
-    square = column.square().sum(-1, keepdim=True)
-    # A comparison with what is not a number is false.
-    usable = (square > torch.finfo(square.dtype).tiny) & (square < torch.inf)
-    projection = (column * residual).sum(-1, keepdim=True)
-    return projection / torch.where(usable, square, torch.inf), ~usable
-
-
-def _solve_columns(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
-    dtype = jacobian.dtype
-    length = torch.linalg.vector_norm(jacobian, dim=-2)
-    floor = length.amax(-1, keepdim=True) * _SMALLEST_RELATIVE_COLUMN
-    scale = torch.maximum(length, floor.clamp_min_(_smallest_length(dtype)))
-    columns = jacobian / scale.unsqueeze(-2)
-    products = columns.mT @ torch.cat([columns, residual.unsqueeze(-1)], -1)
-    gram, projected = products[..., :-1], products[..., -1:]
-    eye = torch.eye(gram.shape[-1], dtype=dtype, device=gram.device)
-    # Both systems in one call: choosing between them by a branch would not batch.
-    factor, info = torch.linalg.cholesky_ex(torch.stack([gram, gram.add(eye, alpha=DAMPING)]))
-    projected = projected.expand(2, *scale.shape, 1)
-    plain, damped = torch.cholesky_solve(projected, factor).squeeze(-1).unbind(0)
-    pivots = factor[0].diagonal(dim1=-2, dim2=-1).amin(-1, keepdim=True)
-    tolerance = RANK_TOLERANCE.get(dtype, RANK_TOLERANCE[torch.float32])
-    # Written so that a pivot that is not a number, as of an infinite column, is flagged.
-    well_conditioned = (pivots > tolerance**0.5) & (info[0].unsqueeze(-1) == 0)
-    return torch.where(well_conditioned, plain, damped) / scale, ~well_conditioned
-
-
-def _smallest_length(dtype: torch.dtype) -> float:
-    # Its square must not underflow.
-    return float(torch.finfo(dtype).tiny) ** 0.5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -13,11 +14,10 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_l1.control import law
 from torchrl_l1.control.affine import StepFunction
 from torchrl_l1.control.config import L1Config, Scalars
 from torchrl_l1.control.jacobian import ActionJacobian, ChangeFunction, DynamicsModel, Predicts
-from torchrl_l1.control.law import L1Diagnostics, L1State
+from torchrl_l1.control.state import L1Diagnostics, L1State, init
 
 L1_KEY = "l1"
 """Default key of the nested tensordict that holds the controller's state and signals."""
@@ -83,28 +83,30 @@ class Layout:
         high = self.high if config.action_high is None else config.action_high
         return replace(config, action_low=low, action_high=high)
 
-    def state_spec(self) -> Composite:
-        """Spec of an :class:`~torchrl_l1.control.law.L1State`, one entry per field."""
-        state = law.init([], self.observation_dim, self.action_dim, dtype=self.dtype)
+    def state_spec(self, config: L1Config) -> Composite:
+        """Spec of an :class:`~torchrl_l1.control.L1State` with these settings."""
+        state = init([], self.observation_dim, self.action_dim, config, dtype=self.dtype)
         return self._composite(
-            {name: (value.shape[-1], value.dtype) for name, value in state._asdict().items()}
+            {name: (value.shape[-1], value.dtype) for name, value in state.entries().items()}
         )
 
-    def spec(self, diagnostics: bool = True) -> Composite:
+    def spec(self, config: L1Config, diagnostics: bool = True) -> Composite:
         """Spec of the state, the executed input ``u_exec`` and, if wanted, the diagnostics."""
         entries = {"u_exec": (self.action_dim, self.action_dtype)}
         if diagnostics:
             for name in L1Diagnostics._fields:
                 entries[name] = (1, torch.bool if name in _FLAGS else self.dtype)
-        spec = self.state_spec()
+        spec = self.state_spec(config)
         spec.update(self._composite(entries))
         return spec
 
-    def zero(self, batch_size: torch.Size, diagnostics: bool = True) -> TensorDictBase:
+    def zero(
+        self, batch_size: torch.Size, config: L1Config, diagnostics: bool = True
+    ) -> TensorDictBase:
         """Entries of a controller that has not started."""
         # An environment that is not batch-locked decides on more dimensions at reset.
         extra = batch_size[: len(batch_size) - len(self.batch_size)]
-        return self.spec(diagnostics).zero(extra)
+        return self.spec(config, diagnostics).zero(extra)
 
     def _composite(self, entries: dict[str, tuple[int, torch.dtype]]) -> Composite:
         specs: dict[str, TensorSpec] = {}
@@ -123,7 +125,7 @@ def pack(
     device: torch.device | None = None,
 ) -> TensorDict:
     """Nested tensordict of the next state, the executed input and the diagnostics."""
-    entries: dict[str, Tensor] = state._asdict()
+    entries = state.entries()
     entries["u_exec"] = executed
     if diagnostics is not None:
         entries.update(diagnostics._asdict())
@@ -189,6 +191,7 @@ def as_action_jacobian(
 
 def advance(
     step: StepFunction,
+    names: Sequence[str],
     tensordict: TensorDictBase,
     observation_key: NestedKey,
     action_key: NestedKey,
@@ -197,7 +200,7 @@ def advance(
     owner: str,
     remedy: str,
 ) -> tuple[Tensor, Tensor, TensorDict]:
-    """Read a step's inputs from a tensordict and take the step.
+    """Read a step's inputs, the state's entries of those names among them, and take the step.
 
     Returns:
         the policy's action, the executed input (both in the action's type) and the nested
@@ -208,11 +211,11 @@ def advance(
     nested = tensordict.get(key, None)
     if nested is None or not isinstance(nested, TensorDictBase):
         raise KeyError(f"{owner} found no state under {key!r}: {remedy}")
-    values = [nested.get(name, None) for name in L1State._fields]
-    missing = [name for name, value in zip(L1State._fields, values, strict=True) if value is None]
+    entries = {name: nested.get(name, None) for name in names}
+    missing = [name for name, value in entries.items() if value is None]
     if missing:
         raise KeyError(f"{owner} found no {missing} under {key!r}: {remedy}")
-    state = L1State(*values)
+    state = L1State(**entries)
     for name, value, like in (
         (observation_key, observation, state.x_hat),
         (action_key, action, state.q),

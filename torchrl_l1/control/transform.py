@@ -19,6 +19,7 @@ from torchrl_l1.control.affine import StepFunction, make_step
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import Predicts
 from torchrl_l1.control.layout import L1_KEY, Dynamics, Layout, advance, as_action_jacobian
+from torchrl_l1.control.state import state_names
 
 # Where a step's outcome waits, inside the tensordict, for the base environment to return.
 _PENDING = "_l1_pending"
@@ -101,6 +102,7 @@ class L1Transform(Transform):
         self.observation_key = unravel_key(observation_key)
         self.action_key = unravel_key(action_key)
         self.key = key
+        self._state_names = state_names(self.config)
         self.compile_mode = compile
         self.diagnostics = diagnostics
         self.dtype = self.model.dtype if dtype is None else dtype
@@ -121,12 +123,12 @@ class L1Transform(Transform):
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the controller's state and signals."""
         self._check_order()
-        observation_spec[self.key] = self._resolve().spec(self.diagnostics)
+        observation_spec[self.key] = self._resolve().spec(self.config, self.diagnostics)
         return observation_spec
 
     def transform_state_spec(self, state_spec: TensorSpec) -> TensorSpec:
         """Add the controller's state, which a step reads."""
-        state_spec[self.key] = self._resolve().state_spec()
+        state_spec[self.key] = self._resolve().state_spec(self.config)
         return state_spec
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -146,6 +148,7 @@ class L1Transform(Transform):
         assert self._step_function is not None
         _, executed, following = advance(
             self._step_function,
+            self._state_names,
             tensordict,
             self.observation_key,
             self.action_key,
@@ -174,7 +177,7 @@ class L1Transform(Transform):
             tensordict_reset.get(self.observation_key), tensordict.get("_reset", None)
         )
         return tensordict_reset.set(
-            self.key, layout.zero(tensordict_reset.batch_size, self.diagnostics)
+            self.key, layout.zero(tensordict_reset.batch_size, self.config, self.diagnostics)
         )
 
     def _reset_on_native_autoreset(
@@ -183,7 +186,7 @@ class L1Transform(Transform):
         # Here nothing is merged afterwards, and the mask says which rows are new.
         nested = tensordict_reset.get(self.key)
         reset = tensordict.get("_reset").reshape(nested.batch_size)
-        fresh = self._resolve().zero(nested.batch_size, self.diagnostics)
+        fresh = self._resolve().zero(nested.batch_size, self.config, self.diagnostics)
         return tensordict_reset.set(self.key, fresh.where(reset, nested))
 
     def _resolve(self) -> Layout:

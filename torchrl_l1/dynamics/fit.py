@@ -185,6 +185,27 @@ def evaluate_members(
     return total / data.shape[0]
 
 
+@torch.no_grad()
+def one_step_residuals(
+    dynamics: EnsembleDynamics, data: TensorDictBase, chunk: int = 20_000
+) -> Tensor:
+    """What the mean of the elites misses of transitions ``[N]``: ``(N, n)``, state units.
+
+    Args:
+        dynamics: the model.
+        data: with ``observation``, ``action`` and ``("next", "observation")``.
+        chunk: rows evaluated at once.
+    """
+    return torch.cat(
+        [
+            part["next", "observation"]
+            - part["observation"]
+            - dynamics.mean_change(part["observation"], part["action"])
+            for part in data.split(chunk)
+        ]
+    )
+
+
 def split_validation(
     buffer: ReplayBuffer, purpose: str, items: str, setting: str
 ) -> tuple[TensorDictBase, TensorDictBase]:
@@ -301,6 +322,7 @@ def fit_ensemble(
         best_loss = evaluate_members(loss, validation)
     if config.elites is not None:
         dynamics.set_elites(best_loss.topk(config.elites, largest=False).indices)
+    dynamics.residuals.measure(one_step_residuals(dynamics, validation))
     return FitReport(
         train_loss=running.item() / (members * (batch + 1)),
         validation_loss=best_loss.mean().item(),

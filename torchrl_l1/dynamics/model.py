@@ -8,9 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchrl_l1.checks import check_choice
+from torchrl_l1.control import ResidualStatistics
 from torchrl_l1.dynamics.ensemble import EnsembleMLP
 from torchrl_l1.dynamics.heads import DeterministicHead, Head
 from torchrl_l1.dynamics.normalizer import DataBox, Normalizer
+from torchrl_l1.dynamics.residuals import Residuals
 
 
 class EnsembleDynamics(nn.Module):
@@ -38,6 +41,7 @@ class EnsembleDynamics(nn.Module):
         affine_in_action: whether members give the coefficients of a function that is affine in
             the action, which their networks then do not read: a :class:`ControlAffineDynamics`.
             Planning networks and fits go by it.
+        residuals: covariance of the one-step residuals, measured at each fit.
 
     Examples:
         >>> import torch
@@ -71,6 +75,7 @@ class EnsembleDynamics(nn.Module):
         self.action_normalizer = Normalizer(action_dim, std_floor)
         self.change_normalizer = Normalizer(observation_dim, std_floor)
         self.box = DataBox(observation_dim, box_margin)
+        self.residuals = Residuals(observation_dim)
 
     def _make_network(self, hidden: Sequence[int], members: int, activation: str) -> EnsembleMLP:
         n, m = self.observation_dim, self.action_dim
@@ -262,6 +267,47 @@ class EnsembleDynamics(nn.Module):
             return self._in_raw_units(*tangents_at(moved.reshape(-1)), observation.shape)
 
         return mean.reshape(observation.shape), at
+
+    def residual_covariance(
+        self, observation: Tensor, action: Tensor, source: str = "residuals"
+    ) -> Tensor:
+        r"""Covariance of the change of state around :meth:`mean_change`.
+
+        Args:
+            observation: ``(..., n)``, raw units.
+            action: ``(..., m)``, raw units.
+            source: ``"residuals"``, those of the fit's validation data; ``"heads"``, the elites'
+                mean predicted variance; ``"disagreement"``, the covariance of their means; or
+                ``"sum"``, all three. The middle two, which may be singular, get a hundredth of
+                the first.
+
+        Returns:
+            ``(n, n)`` for ``"residuals"``, else ``(..., n, n)``; state units squared.
+
+        Raises:
+            ValueError: for another source.
+        """
+        check_choice("source", source, ("residuals", "heads", "disagreement", "sum"))
+        measured = self.residuals.covariance
+        if source == "residuals":
+            return measured
+        mean, std = self.member_distribution(observation, action)
+        mean, std = mean[self.elites], std[self.elites]
+        covariance = measured if source == "sum" else 0.01 * measured
+        if source in ("heads", "sum"):
+            covariance = covariance + torch.diag_embed(std.square().mean(0))
+        if source in ("disagreement", "sum"):
+            apart = (mean - mean.mean(0)).movedim(0, -1)
+            covariance = covariance + apart @ apart.mT / max(1, len(self.elites) - 1)
+        return covariance
+
+    def residual_statistics(
+        self, observation: Tensor, action: Tensor, source: str = "residuals"
+    ) -> ResidualStatistics:
+        """:meth:`residual_covariance` and what its calibration found, for the L1 controller."""
+        covariance = self.residual_covariance(observation, action, source)
+        known = self.residuals
+        return ResidualStatistics(covariance, known.inflation, known.process_noise)
 
     def _over_elites(self, per_member: Tensor) -> Tensor:
         """Mean of ``(E, ...)`` over the elites."""

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_l1.control import L1Config, law
+from torchrl_l1.control import L1Config, init, law
 
 _INPUTS = ("obs", "drift", "jac", "action", "switch", "dt", "bound")
 _OUTPUTS = ("u", "sigma_m", "x_hat")
@@ -89,7 +89,7 @@ def _largest_error(name: str, trace: Mapping[str, np.ndarray]) -> float:
         action_high=float(trace["bound"]),
     )
     obs, drift, jac, action = (fields[field] for field in ("obs", "drift", "jac", "action"))
-    state = law.init([], obs.shape[-1], action.shape[-1], dtype=torch.float64)
+    state = init([], obs.shape[-1], action.shape[-1], dtype=torch.float64)
     error = 0.0
     for t in range(len(obs)):
         restart = fields["switch"][t].reshape(1).bool()

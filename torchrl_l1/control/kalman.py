@@ -1,0 +1,115 @@
+"""The matched disturbance as the state of a Kalman filter, and where to act on it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Posterior(NamedTuple):
+    """What is known of the matched disturbance.
+
+    Attributes:
+        mean: ``(..., m)``, action units.
+        covariance: ``(..., m, m)``, action units squared.
+    """
+
+    mean: Tensor
+    covariance: Tensor
+
+
+def time_update(covariance: Tensor, process_noise: Tensor | float) -> Tensor:
+    """Covariance after one step of a random walk.
+
+    Args:
+        covariance: ``(..., m, m)``.
+        process_noise: standard deviation of the walk's step, ``(m,)`` or a number.
+
+    Returns:
+        ``(..., m, m)``.
+    """
+    variance = torch.as_tensor(process_noise, dtype=covariance.dtype, device=covariance.device)
+    variance = variance.square().expand(covariance.shape[-1])
+    return covariance + torch.diag_embed(variance)
+
+
+def measurement_update(prior: Posterior, jacobian: Tensor, innovation: Tensor) -> Posterior:
+    r"""Condition the disturbance on ``innovation = jacobian (d - mean) + white noise``.
+
+    With :math:`P = L L^\top`, white measurements of unit variance and
+    :math:`M = I + (J L)^\top J L = C C^\top`, the posterior covariance is
+    :math:`(C^{-1} L^\top)^\top C^{-1} L^\top`: positive semi-definite whatever the rounding, and
+    without an inverse of the size of the observation.
+
+    Args:
+        prior: mean and positive definite covariance.
+        jacobian: whitened input matrix ``(..., n, m)``.
+        innovation: whitened residual less what the prior expects ``(..., n)``.
+
+    Returns:
+        the posterior.
+
+    Examples:
+        >>> prior = Posterior(torch.zeros(1), torch.eye(1))
+        >>> measurement_update(prior, torch.ones(1, 1), torch.ones(1))
+        Posterior(mean=tensor([0.5000]), covariance=tensor([[0.5000]]))
+    """
+    factor = torch.linalg.cholesky_ex(_bolstered(prior.covariance))[0]
+    seen = jacobian @ factor
+    eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
+    inner = torch.linalg.cholesky_ex(eye + seen.mT @ seen)[0]
+    half = torch.linalg.solve_triangular(inner, factor.mT, upper=False)
+    covariance = half.mT @ half
+    score = jacobian.mT @ innovation.unsqueeze(-1)
+    return Posterior(prior.mean + (covariance @ score).squeeze(-1), covariance)
+
+
+def _bolstered(covariance: Tensor) -> Tensor:
+    # Directions that were seen well beside some that never were have variances whose ratio may
+    # be beyond the type's digits.
+    least = 8 * torch.finfo(covariance.dtype).eps
+    trace = covariance.diagonal(dim1=-2, dim2=-1).mean(-1)
+    eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
+    return covariance + (least * trace)[..., None, None] * eye
+
+
+def noise_ratio(covariance: Tensor, jacobian: Tensor, posterior: Posterior, left: Tensor) -> Tensor:
+    r"""How much larger than expected one residual's squares are, state by state: ``(..., n)``.
+
+    :math:`((r - J d)_i^2 + (J P J^\top)_{ii}) / \Lambda_{ii}` with the posterior mean and
+    covariance of the disturbance: the E step of expectation maximisation, in which what the
+    disturbance explains is no noise and what is not known of it counts as expected.
+
+    Args:
+        covariance: expected covariance of the residual :math:`\Lambda` ``(..., n, n)``.
+        jacobian: ``(..., n, m)``.
+        posterior: of the disturbance, this residual included.
+        left: what it leaves unexplained of the residual, :math:`r - J d` ``(..., n)``.
+
+    Returns:
+        the ratios ``(..., n)``; their mean is one where the expectation is right.
+    """
+    unseen = ((jacobian @ posterior.covariance) * jacobian).sum(-1)
+    return (left.square() + unseen) / covariance.diagonal(dim1=-2, dim2=-1)
+
+
+def significant(posterior: Posterior, dead_zone: float) -> Tensor:
+    r"""The part of the disturbance that is acted on, entry by entry: ``(..., m)``.
+
+    :math:`d \max(0, 1 - (z s / |d|)^2)` with :math:`s` the posterior standard deviation: nothing
+    within ``dead_zone`` standard deviations, nearly all of it far beyond.
+
+    Args:
+        posterior: of the disturbance.
+        dead_zone: :math:`z`; zero acts on the whole mean.
+
+    Examples:
+        >>> posterior = Posterior(torch.tensor([0.1, 1.0]), 0.01 * torch.eye(2))
+        >>> significant(posterior, 2.0)
+        tensor([0.0000, 0.9600])
+    """
+    variance = posterior.covariance.diagonal(dim1=-2, dim2=-1)
+    square = posterior.mean.square().clamp_min(torch.finfo(variance.dtype).tiny)
+    return posterior.mean * (1 - dead_zone**2 * variance / square).clamp_min(0)

@@ -1,0 +1,148 @@
+"""What L1 remembers from step to step, what it reports, and what it is told of the residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrl_l1.control.config import L1Config
+
+
+class L1State(NamedTuple):
+    """What the controller remembers from one step to the next.
+
+    Attributes:
+        x_hat: predicted observation ``(..., n)``.
+        u_bar: operating point of the affine model ``(..., m)``.
+        q: filter state ``(..., m)``; the adaptive input is ``-q``.
+        sigma_m: matched uncertainty estimated at the last step ``(..., m)``, action units,
+            projected if the configuration asks for it.
+        n_switch: switches since the reset ``(..., 1)``, int64.
+        started: whether the other entries mean anything ``(..., 1)``, bool.
+        covariance: of the Kalman filter's estimate, which is ``sigma_m`` then,
+            ``(..., m * m)``; like the following ``None`` for the low-pass filter.
+        noise: running estimate of the squares of the residuals, relative to what their
+            covariance says ``(..., n)``.
+        jacobian: of the last step ``(..., n * m)``.
+        residual_covariance: expected at the last step ``(..., n * n)``; ``None`` if it is the
+            same everywhere.
+    """
+
+    x_hat: Tensor
+    u_bar: Tensor
+    q: Tensor
+    sigma_m: Tensor
+    n_switch: Tensor
+    started: Tensor
+    covariance: Tensor | None = None
+    noise: Tensor | None = None
+    jacobian: Tensor | None = None
+    residual_covariance: Tensor | None = None
+
+    def entries(self) -> dict[str, Tensor]:
+        """Those that there are, by name."""
+        return {name: value for name, value in self._asdict().items() if value is not None}
+
+
+class ResidualStatistics(NamedTuple):
+    """What is known of the one-step residuals of a model without disturbances.
+
+    Attributes:
+        covariance: ``(n, n)``, or one for each row ``(..., n, n)``; state units squared.
+        inflation: factor on it that makes the Kalman filter's posterior honest.
+        process_noise: standard deviation of a matched disturbance's change per step, as a
+            fraction of half the range of the action.
+    """
+
+    covariance: Tensor
+    inflation: Tensor | float = 1.0
+    process_noise: Tensor | float = 0.003
+
+
+class L1Diagnostics(NamedTuple):
+    """Signals of one step, each ``(..., 1)``; norms are Euclidean.
+
+    Attributes:
+        switch: the operating point moved (bool).
+        affinization_error: error of the affine model at the tested input, state units.
+        prediction_error: norm of the state prediction error, state units.
+        matched: norm of the matched part of the uncertainty estimate, state units per second.
+        unmatched: norm of the part that no action can cancel, state units per second.
+        u_a: norm of the adaptive input before saturation, action units.
+        saturation: fraction of the action's entries that a bound cut.
+        ill_conditioned: the matched part came from damped least squares (bool).
+        non_finite: an input was not finite: L1 stood aside and restarts (bool).
+        posterior_deviation: norm of the standard deviations of the Kalman filter's estimate,
+            action units; zero without it, like the next.
+        significance: largest entry of its estimate in standard deviations.
+    """
+
+    switch: Tensor
+    affinization_error: Tensor
+    prediction_error: Tensor
+    matched: Tensor
+    unmatched: Tensor
+    u_a: Tensor
+    saturation: Tensor
+    ill_conditioned: Tensor
+    non_finite: Tensor
+    posterior_deviation: Tensor
+    significance: Tensor
+
+
+def init(
+    batch_size: Sequence[int],
+    observation_dim: int,
+    action_dim: int,
+    config: L1Config | None = None,
+    *,
+    dtype: torch.dtype | None = None,
+    device: torch.device | str | None = None,
+) -> L1State:
+    """State before the first step: zeros, not started.
+
+    Args:
+        batch_size: leading dimensions.
+        observation_dim: n.
+        action_dim: m.
+        config: the settings, which say what there is to remember; those of the paper if ``None``.
+        dtype: of the entries but ``n_switch`` and ``started``.
+        device: of all entries.
+
+    Examples:
+        >>> init([5], observation_dim=4, action_dim=1).x_hat.shape
+        torch.Size([5, 4])
+    """
+
+    def zeros(width: int, dtype: torch.dtype | None) -> Tensor:
+        return torch.zeros(*batch_size, width, dtype=dtype, device=device)
+
+    memory: dict[str, Tensor] = {}
+    if config is not None and config.filter == "kalman":
+        memory["covariance"] = zeros(action_dim**2, dtype)
+        memory["noise"] = zeros(observation_dim, dtype)
+        memory["jacobian"] = zeros(observation_dim * action_dim, dtype)
+        if config.covariance != "residuals":
+            memory["residual_covariance"] = zeros(observation_dim**2, dtype)
+    return L1State(
+        x_hat=zeros(observation_dim, dtype),
+        u_bar=zeros(action_dim, dtype),
+        q=zeros(action_dim, dtype),
+        sigma_m=zeros(action_dim, dtype),
+        n_switch=zeros(1, torch.int64),
+        started=zeros(1, torch.bool),
+        **memory,
+    )
+
+
+def state_names(config: L1Config) -> tuple[str, ...]:
+    """What a controller with these settings remembers, by name.
+
+    Examples:
+        >>> state_names(L1Config(0.05))
+        ('x_hat', 'u_bar', 'q', 'sigma_m', 'n_switch', 'started')
+    """
+    return tuple(init([], 1, 1, config).entries())
