@@ -105,6 +105,7 @@ def step(
         ValueError: if a shape does not fit the state's.
 
     Examples:
+        >>> from torchrl_l1.control import init
         >>> config = L1Config(0.04, action_low=-1.0, action_high=1.0)
         >>> state = init([2], observation_dim=3, action_dim=1)
         >>> x, drift, u_rl = torch.zeros(2, 3), torch.zeros(2, 3), torch.full((2, 1), 0.5)
