@@ -3,7 +3,14 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict
 
-from torchrl_l1.algorithms.collection import Collection, episode_returns, first_episodes
+from torchrl_l1.algorithms.collection import (
+    ORACLE,
+    Collection,
+    episode_lengths,
+    episode_returns,
+    first_episodes,
+    signal_metrics,
+)
 from torchrl_l1.algorithms.policy import GaussianPolicy, acting
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import EnsembleDynamics
@@ -16,6 +23,7 @@ def test_returns_are_those_of_first_episodes() -> None:
     following = {"done": done, "episode_reward": reward}
     data = TensorDict({"next": following}, batch_size=[2, 4])
     assert episode_returns(data).tolist() == [2.0, 4.0]
+    assert episode_lengths(data).tolist() == [2, 4]
     assert first_episodes(data)["next", "episode_reward"].flatten().tolist() == [1, 2, 1, 2, 3, 4]
 
 
@@ -49,5 +57,19 @@ def test_evaluation_ends_with_the_last_episode() -> None:
     lengths = [int(row.nonzero()[0]) + 1 for row in data["next", "done"].squeeze(-1)]
     assert data.shape == (4, max(lengths)) and min(lengths) < max(lengths) < 200
     assert len(first_episodes(data)) == sum(lengths)
+    assert episode_lengths(data).tolist() == lengths
     returns = [data["next", "reward"][i, :length].sum() for i, length in enumerate(lengths)]
     torch.testing.assert_close(episode_returns(data), torch.stack(returns))
+
+
+def test_the_oracle_stands_in_the_place_of_l1_and_is_labelled_alike() -> None:
+    task = get_task("walker")
+    torch.manual_seed(0)
+    policy = GaussianPolicy(task.observation_dim, task.action_dim, [8])
+    model = EnsembleDynamics(task.observation_dim, task.action_dim, members=2, hidden=(8,))
+    biased = Perturbation(actuator_bias=0.25)
+    collection = Collection(task, 3, acting(policy, task), model, ORACLE, biased, horizon=20)
+    data = collection.collect(0, 0)
+    executed = (data["action"] - 0.25).clamp(-1.0, 1.0)
+    torch.testing.assert_close(data["executed"], executed)
+    assert list(signal_metrics(data)) == ["non_finite_steps"]

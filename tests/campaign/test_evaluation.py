@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
+from torchrl_l1.campaign import evaluation
 from torchrl_l1.campaign.description import (
     CampaignError,
     EvaluationSettings,
@@ -20,7 +22,9 @@ from torchrl_l1.campaign.description import (
 from torchrl_l1.campaign.evaluation import evaluate_run, is_evaluated
 from torchrl_l1.campaign.plan import PlannedRun, plan
 from torchrl_l1.cli import main
+from torchrl_l1.experiment.evaluate import episodes_file
 from torchrl_l1.experiment.launch import compose
+from torchrl_l1.experiment.matrix import suite
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.run_directory import RunDirectory
 
@@ -135,6 +139,40 @@ def test_a_planner_is_tested_once(tmp_path: Path) -> None:
         *(("shooting", "stochastic"), ("cloning", "stochastic"), ("cloning", "deterministic")),
     ]
     assert is_evaluated(RunDirectory(directory), settings)
+
+
+def test_a_suite_is_evaluated_and_made_again_when_it_has_changed(
+    tiny_recipe: Callable[..., DictConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory = run(tiny_recipe("l1=off", "outer_iterations=1"))
+    matrix = {"l1": ["off", "oracle"], "policy": ["stochastic"]}
+    settings = EvaluationSettings("robustness", matrix=matrix, suite="quick", episodes=2)
+    table = evaluate_run(str(directory), "robustness", json.loads(json.dumps(settings.of_a_run())))
+    with table.open() as handle:
+        rows = list(csv.DictReader(handle))
+    assert [row["l1"] for row in rows] == ["off", "oracle"] * len(suite("quick"))
+    with episodes_file(table).open() as handle:
+        episodes = list(csv.DictReader(handle))
+    assert len(episodes) == 2 * len(rows)
+    assert is_evaluated(RunDirectory(directory), settings)
+    assert not is_evaluated(RunDirectory(directory), replace(settings, suite="full"))
+    assert not is_evaluated(RunDirectory(directory), replace(settings, suite=None))
+    fewer = suite("quick")[:-1]
+    monkeypatch.setattr(evaluation, "suite", lambda _: fewer)
+    assert not is_evaluated(RunDirectory(directory), settings)
+
+
+def test_the_campaign_of_robustness_tests_every_run_with_the_oracle(tmp_path: Path) -> None:
+    campaign = read_campaign("robustness")
+    for settings in campaign.evaluations:
+        assert settings.suite == "full" and settings.matrix["l1"][-1] == "oracle"
+        settings.matrix["l1"] = ["off", "paper", "oracle"]
+    runs = plan(campaign, tmp_path / "out")
+    assert {run.values["recipe"] for run in runs} == {
+        *(f"metrpo/{task}" for task in ("inverted_pendulum", "swimmer", "half_cheetah")),
+        *("metrpo/hopper", "metrpo/walker", "pets/inverted_pendulum"),
+    }
+    assert all(len(run.evaluations) == 1 and run.values["l1"] == "off" for run in runs)
 
 
 @pytest.mark.parametrize(

@@ -234,7 +234,7 @@ def test_run_that_changes_while_it_is_copied_is_refused(
     assert not list(this.directory.path.parent.iterdir())
 
 
-@pytest.mark.parametrize("changed", ["noisy.csv", "noisy.yaml"])
+@pytest.mark.parametrize("changed", ["noisy.csv", "noisy.yaml", "episodes/noisy.csv"])
 def test_evaluation_made_again_while_it_is_copied_is_made_here_too(
     changed: str,
     write: Callable[..., Path],

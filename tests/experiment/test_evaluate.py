@@ -15,9 +15,9 @@ from torchrl_l1.algorithms.facts import KINDS
 from torchrl_l1.algorithms.policy import kinds_of
 from torchrl_l1.cli import evaluate as evaluate_command
 from torchrl_l1.cli import main
-from torchrl_l1.experiment.evaluate import TrainedRun, evaluate, load_run
+from torchrl_l1.experiment.evaluate import TrainedRun, evaluate, evaluate_episodes, load_run
 from torchrl_l1.experiment.launch import compose
-from torchrl_l1.experiment.matrix import Condition
+from torchrl_l1.experiment.matrix import Condition, suite
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.settings import SCHEMAS
 
@@ -80,6 +80,65 @@ def test_cells_share_their_random_numbers_and_see_their_disturbance(tiny_recipe:
     assert noisy not in (first, biased)
 
 
+def test_epsilon_zero_moves_the_operating_point_in_every_step(tiny_recipe: Recipe) -> None:
+    trained = load_run(run(tiny_recipe("l1=off")))
+    (row,) = evaluate(trained, [Condition("paper", epsilon=0.0)], 2)
+    assert row["l1/switch_rate"] > 0.5
+    assert row["epsilon"] == 0.0
+
+
+def test_single_episodes_stand_beside_the_means(tiny_recipe: Recipe) -> None:
+    trained = load_run(run(tiny_recipe()))
+    cells = [Condition("off"), Condition("off", disturbances={"bias": 2.0}), Condition("oracle")]
+    tests = list(evaluate_episodes(trained, cells, 3))
+    assert [row for row, _ in tests] == list(evaluate(trained, cells, 3))
+    for row, episodes in tests:
+        assert [one["episode"] for one in episodes] == [0, 1, 2]
+        assert sum(one["return"] for one in episodes) / 3 == pytest.approx(row["return_mean"])
+        assert {one["steps"] for one in episodes} == {row["steps_mean"]} == {15}
+        assert all(
+            one[key] == row[key] for one in episodes for key in cells[0].columns() if key != "stage"
+        )
+    # Without a disturbance there is nothing that the oracle could undo.
+    plain, biased, oracle = ([one["return"] for one in episodes] for _, episodes in tests)
+    assert plain == oracle != biased
+
+
+def test_the_oracle_undoes_a_bias_and_is_nobodys_own_controller(tiny_recipe: Recipe) -> None:
+    trained = load_run(run(tiny_recipe("l1=paper")))
+    cells = [
+        Condition(l1, disturbances={"bias": bias}, policy="deterministic")
+        for l1, bias in (("off", 0.0), ("off", 0.5), ("oracle", 0.5))
+    ]
+    undisturbed, lost, kept = evaluate(trained, cells, 4)
+    assert kept["return_mean"] == pytest.approx(undisturbed["return_mean"], rel=1e-3)
+    assert lost["return_mean"] != pytest.approx(undisturbed["return_mean"], rel=1e-2)
+    assert kept["own_l1"] == 0
+
+
+def test_a_suite_ends_in_a_table_of_what_is_recovered(
+    tiny_recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    directory = run(tiny_recipe("l1=off"))
+    options = ["--suite", "quick", "--episodes", "2", "--policy", "deterministic"]
+    main(["evaluate", str(directory), *options, "--output", str(tmp_path / "out")])
+    printed = capsys.readouterr().out
+    assert "inverted_pendulum: deterministic policy" in printed
+    assert "| L1 paper recovered |" in printed
+    rows = rows_of(tmp_path / "out" / "evaluation.csv")
+    assert len(rows) == len(suite("quick")) * 3
+    episodes = rows_of(tmp_path / "out" / "episodes.csv")
+    assert len(episodes) == 2 * len(rows)
+    assert list(episodes[0])[:4] == ["run", "training_seed", "l1", "noise"]
+    assert list(episodes[0])[-3:] == ["episode", "return", "steps"]
+    summary = rows_of(tmp_path / "out" / "summary.csv")
+    assert {row["recovered_policies"] for row in summary if row["l1"] == "paper"} == {"1"}
+    for name in ("returns", "recovered"):
+        if f"{name}.png" in printed:
+            assert matplotlib.image.imread(tmp_path / "out" / f"{name}.png").std() > 0.05
+    assert "returns.png" in printed
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -87,8 +146,11 @@ def test_cells_share_their_random_numbers_and_see_their_disturbance(tiny_recipe:
         (["evaluate", "nowhere", "--l1", "of"], "unknown l1 setting 'of'; there are off, paper"),
         (["evaluate", "nowhere", "--noise", "loud"], "unknown noise setting"),
         (["evaluate", "nowhere", "--episodes", "0"], "--episodes must be positive"),
-        (["evaluate", "nowhere", "--epsilon", "1", "0"], "--epsilon must be positive and finite"),
-        (["evaluate", "nowhere", "--epsilon", "inf"], "--epsilon must be positive and finite"),
+        (["evaluate", "nowhere", "--epsilon", "1", "-1"], "--epsilon must be finite and not neg"),
+        (["evaluate", "nowhere", "--epsilon", "inf"], "--epsilon must be finite and not negative"),
+        (["evaluate", "nowhere", "--suite", "loud"], "argument --suite: invalid choice"),
+        (["evaluate", "nowhere", "--suite", "full", "--bias", "1"], "--suite and --bias both say"),
+        (["evaluate", "nowhere", "--suite", "full", "--filmstrip"], "in place of --suite"),
         (["evaluate", "nowhere", "--alpha", "0.1", "1.5"], "--alpha must be above 0 and at most 1"),
         (["evaluate", "nowhere", "--alpha", "nan"], "--alpha must be above 0 and at most 1"),
         (["evaluate", "nowhere", "--bias", "0", "inf"], "--bias must be finite, got inf"),

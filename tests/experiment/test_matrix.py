@@ -10,7 +10,17 @@ import pytest
 from torchrl_l1.campaign import CampaignError, EvaluationSettings
 from torchrl_l1.cli.evaluate import add_arguments
 from torchrl_l1.envs import DISTURBANCES
-from torchrl_l1.experiment.matrix import Condition, axes, conditions
+from torchrl_l1.experiment.matrix import (
+    SUITE_L1,
+    SUITES,
+    Condition,
+    axes,
+    conditions,
+    disturbance_words,
+    disturbed,
+    suite,
+    undisturbed,
+)
 
 
 def test_conditions_vary_bias_and_gain_apart() -> None:
@@ -60,8 +70,10 @@ def test_options_keys_and_columns_have_the_same_names_and_defaults() -> None:
     names = list(Condition("off").columns())
     assert names == [axis.name for axis in axes()]
     # As in files that are older than this, how many episodes there are stands between them.
-    assert [key for key in settings if key not in ("episodes", "seed")] == names
-    assert list(settings)[4:7] == ["policy", "episodes", "seed"]
+    own = ("episodes", "seed", "suite")
+    assert [key for key in settings if key not in own] == names
+    after = list(settings).index("policy")
+    assert list(settings)[after : after + 3] == ["policy", "episodes", "seed"]
     assert {name: options[name] for name in settings} == settings
     assert conditions(**{name: settings[name] for name in names}) == conditions()
 
@@ -79,3 +91,42 @@ def test_conditions_are_equal_by_what_they_set() -> None:
     one = Condition("off", disturbances={"gain": 1.0, "bias": 0.5})
     assert one == Condition("off", disturbances={"bias": 0.5}) != Condition("off")
     assert len({one, Condition("off", disturbances={"bias": 0.5}), Condition("off")}) == 2
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_a_suite_is_tested_cell_by_cell_with_each_controller(name: str) -> None:
+    cells = conditions(name, l1=["off", "paper", "oracle"], policy=["stochastic"], epsilon=[0, 1.0])
+    expected = [
+        (disturbance, l1, epsilon)
+        for disturbance in suite(name)
+        for l1, tried in (("off", [None]), ("paper", [0, 1.0]), ("oracle", [None]))
+        for epsilon in tried
+    ]
+    found = [(disturbed(cell.columns()), cell.l1, cell.epsilon) for cell in cells]
+    assert found == expected
+    assert undisturbed(cells[0].columns()) and not undisturbed(cells[-1].columns())
+
+
+def test_suites_stand_in_place_of_values_and_bring_an_oracle() -> None:
+    assert EvaluationSettings("e", suite="quick").matrix["l1"] == list(SUITE_L1)
+    assert EvaluationSettings("e", suite="quick", matrix={"l1": ["off"]}).matrix["l1"] == ["off"]
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    for arguments, l1 in (
+        (["--suite", "full"], list(SUITE_L1)),
+        (["--suite", "full", "--l1", "off", "paper"], ["off", "paper"]),
+        (["--l1", "off", "paper", "--suite", "full"], ["off", "paper"]),
+        ([], ["off", "paper"]),
+    ):
+        assert parser.parse_args(["somewhere", *arguments]).l1 == l1
+    with pytest.raises(ValueError, match="unknown suite 'all'; there are quick, full"):
+        conditions("all")
+    with pytest.raises(ValueError, match="suite and gain both say"):
+        conditions("quick", gain=[1.0, 0.5])
+
+
+def test_conditions_are_named_by_what_is_not_neutral() -> None:
+    columns = Condition("off", disturbances={"gain": 0.5}).columns()
+    assert (disturbed(columns), disturbance_words(columns)) == ({"gain": 0.5}, "gain 0.5")
+    # As in tables that are older than a disturbance.
+    assert disturbance_words({"bias": 1.0}) == "bias 1"

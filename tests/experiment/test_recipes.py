@@ -20,7 +20,7 @@ from torchrl_l1.campaign import read_campaign
 from torchrl_l1.campaign.plan import cells
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import ControlAffineDynamics, EnsembleDynamics
-from torchrl_l1.envs import get_task
+from torchrl_l1.envs import DISTURBANCES, get_task
 from torchrl_l1.experiment.errors import RecipeError
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import (
@@ -258,6 +258,11 @@ FILE = Path(__file__).with_name("recipe_digests.json")
 # Settings that there were not when the digests were made, with the value that does what was done.
 NEWER = {"fit.precision": "float32", "precision": "float32"}
 
+NEWER_IN_EVALUATIONS = {
+    "suite": None,
+    **{n: [entry.neutral] for n, entry in DISTURBANCES.items() if n not in ("bias", "gain")},
+}
+
 
 def digest(*settings: DictConfig) -> str:
     text = "---\n".join(OmegaConf.to_yaml(without_newer(one), resolve=True) for one in settings)
@@ -297,7 +302,12 @@ def of_campaign(name: str) -> dict[str, str]:
         for cell in (first, last):
             place = (f"{key}={value}" for key, value in cell.items())
             runs.append(resolved(matrix.recipe, *matrix.overrides, *place))
-    return {"file": digest(OmegaConf.create(campaign.to_dict())), "runs": digest(*runs)}
+    whole = campaign.to_dict()
+    for evaluation in whole["evaluations"]:
+        for key, value in NEWER_IN_EVALUATIONS.items():
+            if evaluation[key] == value:
+                del evaluation[key]
+    return {"file": digest(OmegaConf.create(whole)), "runs": digest(*runs)}
 
 
 @cache

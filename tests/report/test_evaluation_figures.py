@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import matplotlib.image
 import pytest
 from matplotlib.figure import Figure
 
+from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.report import evaluation_figures, report
 from torchrl_l1.report.evaluation_figures import (
     RANGES,
@@ -167,6 +169,47 @@ def test_panels_hold_the_rows(drawn: list[Figure], tmp_path: Path) -> None:
         spans = axis.collections[1].get_segments()
         assert [s[1, 1] - s[0, 1] for s in spans] == pytest.approx([0.2] * 3)
         assert [s[0, 0] for s in spans] == pytest.approx(fast.get_xdata())
+
+
+def test_a_tolerance_of_zero_stands_a_step_below_the_others(
+    drawn: list[Figure], tmp_path: Path
+) -> None:
+    plot_tuning(rows_of((0.0, 0.1, 1.0), (0.35,)), "Task", tmp_path / "figure.png")
+    switches, quiet, _ = (axis for axis in drawn[0].axes if axis.get_visible())
+    for axis in (switches, quiet):
+        assert list(axis.get_lines()[0].get_xdata()) == pytest.approx([0.01, 0.1, 1.0])
+        assert list(axis.get_xticks()) == pytest.approx([0.01, 0.1, 1.0])
+        assert [label.get_text() for label in axis.get_xticklabels()] == ["0", "0.1", "1"]
+
+
+def test_of_many_disturbances_those_with_several_magnitudes_are_drawn(
+    drawn: list[Figure], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ["lag", "play", "load", "wind"]
+    for name in names:
+        entry = replace(DISTURBANCES["bias"], name=name, setting=f"actuator_{name}")
+        monkeypatch.setitem(DISTURBANCES, name, entry)
+    nothing = dict.fromkeys(names, 0.0)
+    levels = {"bias": (1.0, 2.0), **{name: (1.0, 2.0) for name in names}, "gain": (0.5,)}
+    rows = [row("off", return_mean=0.0, **nothing)] + [
+        {**row("off", return_mean=-value, **nothing), name: value}
+        for name, values in levels.items()
+        for value in values
+    ]
+    rows += [{**one, "l1": "paper", "difference_mean": 1.0} for one in rows]
+    plot_disturbances(rows, "Task", tmp_path / "figure.png", METRPO)
+    panels = [axis for axis in drawn[0].axes if axis.get_visible()]
+    found = [(axis.get_xlabel().split()[1], axis.get_ylabel()[:10]) for axis in panels]
+    # Four across, each difference below its return.
+    first, last = ["bias", "lag", "play", "load"], ["wind"]
+    assert found == [
+        (name, words)
+        for group in (first, last)
+        for words in ("return (su", "return, le")
+        for name in group
+    ]
+    left = {round(axis.get_position().x0, 2) for axis in panels}
+    assert len(left) == 4
 
 
 def test_alpha_alone_takes_the_axis(drawn: list[Figure], tmp_path: Path) -> None:

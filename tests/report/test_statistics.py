@@ -13,6 +13,7 @@ from torchrl_l1.report.statistics import (
     interquartile_mean,
     mean_interval,
     published_spread,
+    recovered,
 )
 
 SEEDS = st.lists(st.floats(-1e4, 1e4).map(lambda x: round(x, 3)), min_size=3, max_size=12)
@@ -111,3 +112,82 @@ def test_no_interval_of_too_few_and_a_point_of_equal_ones() -> None:
     for count in (3, 9, 10):
         assert mean_interval([4.0] * count) == Interval(4.0, 4.0)
     assert interquartile_interval([4.0] * 5) == Interval(4.0, 4.0)
+
+
+def sample(
+    rng: np.random.Generator, policies: int, episodes: int, share: float, gap: float
+) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    """Policies that differ in all: in their level, in the gap and in what is recovered of it."""
+    level, gaps = rng.normal(0, 50, (policies, 1)), gap * rng.uniform(0.5, 1.5, (policies, 1))
+    shares = share + rng.normal(0, 0.15, (policies, 1))
+    common = level + rng.normal(0, 20, (policies, episodes))
+
+    def noisy(mean: np.ndarray) -> list[np.ndarray]:
+        return list(common + mean + rng.normal(0, 10, common.shape))
+
+    return noisy(0 * gaps), noisy(shares * gaps), noisy(gaps)
+
+
+def test_recovered_interval_covers_the_truth_about_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(0)
+    covered, errors = [], []
+    for _ in range(150):
+        found = recovered(*sample(rng, 12, 10, 0.6, 100.0))
+        assert found.share is not None and found.interval is not None
+        covered.append(found.interval.low <= 0.6 <= found.interval.high)
+        errors.append(found.share - 0.6)
+    assert 0.87 < np.mean(covered) < 0.99
+    assert abs(np.mean(errors)) < 0.02
+
+
+def test_recovered_is_empty_where_there_is_no_gap() -> None:
+    rng = np.random.default_rng(1)
+    empty = [recovered(*sample(rng, 12, 10, 0.6, 0.0)).share is None for _ in range(100)]
+    assert np.mean(empty) > 0.9
+    kept = recovered(*sample(rng, 12, 10, 0.6, 100.0))
+    assert kept.gap_interval.low < kept.gap < kept.gap_interval.high and kept.policies == 12
+
+
+def test_recovered_pairs_episodes() -> None:
+    start = np.random.default_rng(2).normal(0, 1e6, (3, 5))
+    found = recovered(list(start), list(start + 3.0), list(start + 4.0))
+    assert found.share == pytest.approx(0.75)
+    assert found.interval is not None
+    assert (found.interval.low, found.interval.high) == pytest.approx((0.75, 0.75))
+    assert found.gap == pytest.approx(4.0)
+
+
+def test_recovered_of_one_policy_is_the_bootstrap_over_its_episodes() -> None:
+    rng = np.random.default_rng(3)
+    off, on, oracle = (rng.normal(mean, 1.0, 30) for mean in (0.0, 2.0, 4.0))
+    found = recovered([off], [on], [oracle])
+    draws = np.random.default_rng(4).integers(30, size=(20_000, 30))
+    shares = (on - off)[draws].mean(1) / (oracle - off)[draws].mean(1)
+    assert found.interval is not None and found.policies == 1
+    assert (found.interval.low, found.interval.high) == pytest.approx(
+        tuple(np.quantile(shares, [0.025, 0.975])), abs=0.01
+    )
+    assert found == recovered([off], [on], [oracle])
+
+
+def test_recovered_over_policies_is_wider_than_over_their_episodes_alone() -> None:
+    # Two policies that recover all and nothing, without any noise in the episodes.
+    off, oracle = [np.zeros(4)] * 2, [np.ones(4)] * 2
+    found = recovered(off, [np.zeros(4), np.ones(4)], oracle)
+    assert found.interval is not None
+    values = (found.share, found.interval.low, found.interval.high)
+    assert values == pytest.approx((0.5, 0.0, 1.0))
+
+
+def test_a_gap_of_either_sign_can_be_undone() -> None:
+    off, oracle = [np.array([5.0, 6.0, 7.0])], [np.array([1.0, 2.0, 3.0])]
+    found = recovered(off, oracle, oracle)
+    assert (found.gap, found.share) == pytest.approx((-4.0, 1.0))
+
+
+@pytest.mark.parametrize("on", [[], [np.zeros(2)], [np.zeros(3), np.zeros(3)]])
+def test_recovered_needs_the_same_episodes(on: list[np.ndarray]) -> None:
+    with pytest.raises(ValueError, match="the same episodes of the same policies"):
+        recovered([np.zeros(3)], on, [np.zeros(3)])
+    with pytest.raises(ValueError, match="the same episodes of the same policies"):
+        recovered([], [], [])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
+from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -16,7 +17,7 @@ from torchrl.envs import EnvBase, RewardSum, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_type
 
 from torchrl_l1.compilation import CompileMode
-from torchrl_l1.control import L1Config, L1Transform
+from torchrl_l1.control import L1Config, L1Transform, OracleTransform
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.envs import Perturbation, Task, make_env
 
@@ -59,13 +60,16 @@ _L1_MEANS = {
 }
 _L1_MEANS_AND_MAXIMA = ("affinization_error", "prediction_error", "matched", "unmatched", "u_a")
 
+ORACLE: Literal["oracle"] = "oracle"
+"""In place of L1's settings: the oracle, which is told the matched disturbances."""
+
 
 def make_pipeline(
     task: Task,
     num_envs: int,
     perturbation: Perturbation,
     dynamics: EnsembleDynamics,
-    l1: L1Config | None,
+    l1: L1Config | Literal["oracle"] | None,
     horizon: int | None = None,
     compile_l1: CompileMode = False,
     extra: Sequence[Transform] = (),
@@ -73,9 +77,14 @@ def make_pipeline(
     """The perturbed environment, augmented by L1 unless ``l1`` is ``None``, and ``extra``.
 
     The order matters: on its way in, an action meets L1 first and the noise last; on its way
-    out, an observation is noisy before L1 sees it.
+    out, an observation is noisy before L1 sees it. With :data:`ORACLE`, an
+    :class:`~torchrl_l1.control.OracleTransform` stands in L1's place.
     """
-    controller = [] if l1 is None else [L1Transform(dynamics, l1, compile=compile_l1)]
+    controller: list[Transform] = []
+    if isinstance(l1, L1Config):
+        controller = [L1Transform(dynamics, l1, compile=compile_l1)]
+    elif l1 == ORACLE:
+        controller = [OracleTransform()]
     return make_env(
         task,
         num_envs,
@@ -98,7 +107,7 @@ class Collection:
         episodes: int,
         policy: TensorDictModuleBase,
         dynamics: EnsembleDynamics,
-        l1: L1Config | None,
+        l1: L1Config | Literal["oracle"] | None,
         perturbation: Perturbation,
         horizon: int | None = None,
         compile_l1: CompileMode = False,
@@ -226,7 +235,7 @@ def signal_metrics(data: TensorDictBase) -> dict[str, float]:
     """Non-finite steps, and means and maxima of L1's signals if it is on."""
     metrics: dict[str, float] = {"non_finite_steps": int(data["next", "non_finite"].sum())}
     signals = data.get(("next", "l1"), None)
-    if signals is not None:
+    if signals is not None and "non_finite" in signals:  # the oracle has none
         metrics["l1/non_finite"] = int(signals["non_finite"].sum())
         for name, label in _L1_MEANS.items():
             metrics[f"l1/{label}"] = signals[name].float().mean().item()
@@ -245,6 +254,12 @@ def episode_returns(data: TensorDictBase) -> Tensor:
     done = data["next", "done"].squeeze(-1)
     first = done & (done.cumsum(1) == 1)
     return data["next", "episode_reward"].squeeze(-1)[first]
+
+
+def episode_lengths(data: TensorDictBase) -> Tensor:
+    """Steps of the first episode of every environment in ``[N, T]``: ``(N,)``."""
+    done = data["next", "done"].squeeze(-1)
+    return (done.cumsum(1) - done.long() == 0).sum(1)
 
 
 def first_episodes(data: TensorDictBase) -> TensorDictBase:

@@ -11,7 +11,15 @@ from typing import Any, TypeVar
 
 import yaml  # type: ignore[import-untyped]
 
-from torchrl_l1.experiment.matrix import Axis, axes, check_values
+from torchrl_l1.experiment.matrix import (
+    SUITE_L1,
+    Axis,
+    Condition,
+    axes,
+    check_suite,
+    check_values,
+    conditions,
+)
 from torchrl_l1.experiment.recipes import find_campaign
 
 
@@ -140,6 +148,8 @@ class EvaluationSettings:
             which acts in one way only, is tested once whatever ``policy`` says.
         episodes: episodes per cell.
         seed: seed of resets, noise and sampled actions.
+        suite: name of a suite of disturbances, in place of values of them. With it, ``l1`` is
+            ``[off, paper, oracle]`` if it is not given.
     """
 
     name: str
@@ -147,6 +157,7 @@ class EvaluationSettings:
     matrix: dict[str, list[Any]] = field(default_factory=dict)
     episodes: int = 25
     seed: int = 0
+    suite: str | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not _PLAIN.fullmatch(self.name):
@@ -159,13 +170,15 @@ class EvaluationSettings:
         for key in self.matrix:
             if key not in [axis.name for axis in every]:
                 raise CampaignError(f"an evaluation does not vary {key!r}")
-        self.matrix = {axis.name: _axis_values(axis, self.matrix) for axis in every}
+        given = {"l1": list(SUITE_L1), **self.matrix} if self.suite is not None else self.matrix
+        self.matrix = {axis.name: _axis_values(axis, given) for axis in every}
         for key, least in (("episodes", 1), ("seed", 0)):
             value = getattr(self, key)
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
                 raise CampaignError(f"{key} must be a whole number from {least}, got {value!r}")
         try:
             check_values(self.matrix)
+            check_suite(self.suite, self.matrix)
         except ValueError as error:
             raise CampaignError(str(error)) from error
 
@@ -174,7 +187,8 @@ class EvaluationSettings:
         """The keys in a campaign file, in the order in which they are written."""
         varied = [axis.name for axis in axes()]
         how_many = 1 + varied.index("policy")
-        return ["name", "where", *varied[:how_many], "episodes", "seed", *varied[how_many:]]
+        rest = ["episodes", "seed", *varied[how_many:], "suite"]
+        return ["name", "where", *varied[:how_many], *rest]
 
     @classmethod
     def from_keys(cls, **entry: Any) -> EvaluationSettings:
@@ -194,6 +208,10 @@ class EvaluationSettings:
         """The :meth:`keys` with their values."""
         values = {**vars(self), **self.matrix}
         return {key: values[key] for key in self.keys()}
+
+    def conditions(self) -> list[Condition]:
+        """What is tested, in the order of the table."""
+        return conditions(self.suite, **self.matrix)
 
     def of_a_run(self) -> dict[str, Any]:
         """What the table of a single run depends on: all keys but ``name`` and ``where``."""

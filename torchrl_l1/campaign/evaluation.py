@@ -7,13 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_l1.campaign.description import EvaluationSettings, dump_yaml, load_yaml
-from torchrl_l1.experiment.evaluate import distinct, evaluate, load_run
-from torchrl_l1.experiment.matrix import conditions
+from torchrl_l1.experiment.evaluate import distinct, episodes_file, evaluate_episodes, load_run
+from torchrl_l1.experiment.matrix import suite
 from torchrl_l1.experiment.run_directory import RunDirectory, write_atomically, write_table
 
 
 def evaluation_file(run_dir: Path, name: str) -> Path:
-    """The table of an evaluation; its settings have the suffix ``.yaml``."""
+    """The table of an evaluation; its settings have the suffix ``.yaml``.
+
+    The returns of single episodes are in :func:`episodes_file`.
+    """
     return run_dir / "evaluations" / f"{name}.csv"
 
 
@@ -26,17 +29,25 @@ def is_evaluated(directory: RunDirectory, settings: EvaluationSettings) -> bool:
     table = evaluation_file(directory.path, settings.name)
     try:
         before = load_yaml(table.with_suffix(".yaml"))
-        iterations = before.pop("iterations")
+        iterations, cells = before.pop("iterations"), before.pop("disturbances", None)
         made_with = EvaluationSettings.from_keys(name=settings.name, **before)
     except (OSError, ValueError, AttributeError, KeyError, TypeError):
         return False
     now = _described(settings, directory.iterations_done())
-    return table.exists() and _described(made_with, iterations) == now
+    return (
+        table.exists()
+        and _described(made_with, iterations) == now
+        and cells == now.get("disturbances")
+    )
 
 
 def _described(settings: EvaluationSettings, iterations: int) -> dict[str, Any]:
-    """What a table was made from: settings, and how many outer iterations the run had."""
-    return {**settings.of_a_run(), "iterations": iterations}
+    """What a table was made from: settings, and how many outer iterations the run had.
+
+    Of a suite it says the disturbances, too: they may be others in another version.
+    """
+    cells = {} if settings.suite is None else {"disturbances": suite(settings.suite)}
+    return {**settings.of_a_run(), **cells, "iterations": iterations}
 
 
 def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
@@ -48,21 +59,26 @@ def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
         settings: as :meth:`EvaluationSettings.of_a_run` gives them.
 
     Returns:
-        the table.
+        the table; that of the single episodes is :func:`episodes_file` of it.
 
     Raises:
         RunDirectoryError: if the directory holds no run or no checkpoint.
         ValueError: for a stage that the run has not; nothing is changed then.
     """
     chosen = EvaluationSettings.from_keys(name=name, **settings)
-    every = conditions(**chosen.matrix)
     trained = load_run(run_dir)
-    rows = list(evaluate(trained, distinct(trained, every), chosen.episodes, chosen.seed))
+    cells = distinct(trained, chosen.conditions())
+    rows, episodes = [], []
+    for row, single in evaluate_episodes(trained, cells, chosen.episodes, chosen.seed):
+        rows.append(row)
+        episodes += single
     table = evaluation_file(Path(run_dir), name)
     described = table.with_suffix(".yaml")
-    table.parent.mkdir(exist_ok=True)
+    singly = episodes_file(table)
+    singly.parent.mkdir(parents=True, exist_ok=True)
     # In this order: no kill leaves a table beside the settings of another one.
     described.unlink(missing_ok=True)
+    write_table(singly, episodes)
     write_table(table, rows)
     write_atomically(described, dump_yaml(_described(chosen, trained.algorithm.iteration)))
     return table

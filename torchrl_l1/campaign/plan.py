@@ -24,6 +24,7 @@ from torchrl_l1.campaign.description import (
 from torchrl_l1.compilation import check_mode
 from torchrl_l1.envs import get_task
 from torchrl_l1.experiment.errors import USER_ERRORS, RunDirectoryError, message
+from torchrl_l1.experiment.l1_options import check_tested
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run import check_wandb_mode
@@ -224,9 +225,9 @@ def _add_evaluations(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
     for i, settings in enumerate(campaign.evaluations):
         place = f"{campaign.file}: evaluations[{i}] ({settings.name})"
         try:
-            for group in ("l1", "noise"):
-                for option in settings.matrix[group]:
-                    group_setting(group, option)
+            check_tested(settings.matrix["l1"])
+            for option in settings.matrix["noise"]:
+                group_setting("noise", option)
         except ValueError as error:
             raise CampaignError(f"{place}: {error}") from error
         chosen = list(runs)

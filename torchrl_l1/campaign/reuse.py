@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 from torchrl_l1.campaign.description import CampaignError
 from torchrl_l1.campaign.plan import PlannedRun
+from torchrl_l1.experiment.evaluate import episodes_file
 from torchrl_l1.experiment.run_directory import (
     RunDirectory,
     differences,
@@ -101,10 +102,15 @@ def _keep_evaluations(source: Path, copy: Path, wanted: Set[str]) -> None:
 
     A table without its settings is made again.
     """
-    for file in (copy / "evaluations").glob("*.*"):
+    tables = copy / "evaluations"
+    for file in (*tables.glob("*.*"), *tables.glob("episodes/*.*")):
         if file.stem not in wanted:
             file.unlink()
-    for settings in (copy / "evaluations").glob("*.yaml"):
-        names = [settings.with_suffix(".csv").name, settings.name]
+    for settings in tables.glob("*.yaml"):
+        table = settings.with_suffix(".csv")
+        names = [table.name, settings.name]
+        episodes = episodes_file(table)
+        if episodes.exists():  # tables that are older have none
+            names.append(str(episodes.relative_to(tables)))
         if filecmp.cmpfiles(source / "evaluations", settings.parent, names, False)[0] != names:
             settings.unlink()

@@ -22,27 +22,61 @@ from torchrl_l1.envs.rendering import (
 from torchrl_l1.experiment.evaluate import (
     TrainedRun,
     distinct,
-    evaluate,
+    evaluate_episodes,
     load_run,
     make_collection,
 )
-from torchrl_l1.experiment.matrix import Condition, axes, check_values, conditions
+from torchrl_l1.experiment.l1_options import check_tested
+from torchrl_l1.experiment.matrix import (
+    SUITE_L1,
+    SUITES,
+    Condition,
+    axes,
+    check_suite,
+    check_values,
+    conditions,
+)
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.experiment.settings import RunSettings, WandbSettings
 from torchrl_l1.report.evaluation_figures import RANGES, plot_disturbances
 from torchrl_l1.report.evaluation_summary import summarize, summary_tables
+from torchrl_l1.report.recovery import MEDIANS, SHARES, is_about_robustness, plot_heat_map
 
 _SECONDS_SHOWN = 4.0
 _COLUMNS = 10
+
+
+class _Suite(argparse.Action):
+    """The name of a suite, which brings controllers of its own where none are given."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        if namespace.l1 is parser.get_default("l1"):
+            namespace.l1 = list(SUITE_L1)
+        setattr(namespace, self.dest, values)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``torchrl-l1 evaluate``: one for all that it varies, and its own."""
     add = parser.add_argument
     add("run_dir", nargs="+", help="one or more run directories")
+    group = parser.add_argument_group("disturbances", "They vary one at a time, or as in a suite.")
+    group.add_argument(
+        "--suite",
+        choices=SUITES,
+        action=_Suite,
+        help="all disturbances, each at a few values, in place of values of them; --l1 is then "
+        f"{' '.join(SUITE_L1)} by default",
+    )
     for axis in axes():
-        add(
+        where = group if axis.name in DISTURBANCES else parser
+        where.add_argument(
             f"--{axis.name}",
             nargs="+",
             type=axis.kind,
@@ -149,43 +183,52 @@ def _worst(values: Mapping[str, Sequence[float]]) -> tuple[str, float]:
     return (varied or worst)[0]
 
 
+def _plots(summary: Sequence[Mapping[str, Any]], run: TrainedRun, output: Path) -> list[Path]:
+    """Draw returns against magnitudes and, where they say more, heat maps."""
+    heading, facts = run.recipe.recipe, run.algorithm.facts
+    robust = is_about_robustness(summary)
+    lines = output / "robustness.png"
+    drawn = [plot_disturbances(summary, heading, lines, facts, (RANGES,), always=not robust)]
+    for shown, name in ((MEDIANS, "returns"), (SHARES, "recovered")) if robust else ():
+        drawn.append(plot_heat_map(summary, shown, heading, output / f"{name}.png", facts))
+    return [file for file in drawn if file is not None]
+
+
 def evaluate_command(options: argparse.Namespace) -> None:
     """``torchrl-l1 evaluate``: table on the screen, CSV, PNG and, if asked, a filmstrip."""
     values = {axis.name: getattr(options, axis.name) for axis in axes()}
     check_values(values, prefix="--")
-    for group in ("l1", "noise"):
-        for name in values[group]:
-            group_setting(group, name)
+    check_suite(options.suite, values, prefix="--")
+    check_tested(values["l1"])
+    for name in values["noise"]:
+        group_setting("noise", name)
+    if options.filmstrip and options.suite:
+        raise ValueError("--filmstrip shows one disturbance; give it in place of --suite")
     if options.episodes < 1:
         raise ValueError(f"--episodes must be positive, got {options.episodes}")
     runs = [load_run(path) for path in dict.fromkeys(map(Path, options.run_dir))]
     _check_one_study(runs)
     values["stage"] = _stages(runs, options.stage)
-    cells = distinct(runs[0], conditions(**values))
+    cells = distinct(runs[0], conditions(options.suite, **values))
     output = Path(options.output) if options.output else runs[0].path / "evaluation"
-    rows = []
+    rows, episodes = [], []
     total = len(runs) * len(cells)
     with tqdm(total=total, desc="evaluate", unit="cell", disable=None) as progress:
         for trained in runs:
-            for row in evaluate(trained, cells, options.episodes, options.seed):
+            for row, single in evaluate_episodes(trained, cells, options.episodes, options.seed):
                 rows.append(row)
+                episodes += single
                 progress.update()
 
     output.mkdir(parents=True, exist_ok=True)
-    summary = summarize(rows)
-    print(f"\n{summary_tables(summary)}\n")
-    write_table(output / "evaluation.csv", rows)
-    write_table(output / "summary.csv", summary)
-    plot_disturbances(
-        summary,
-        runs[0].recipe.recipe,
-        output / "robustness.png",
-        runs[0].algorithm.facts,
-        (RANGES,),
-        always=True,
-    )
-    print(f"Table: {output / 'evaluation.csv'}, {output / 'summary.csv'}")
-    print(f"Plot: {output / 'robustness.png'}")
+    summary = summarize(rows, episodes)
+    print(f"\n{runs[0].recipe.task}: {summary_tables(summary)}\n")
+    tables = {"evaluation": rows, "episodes": episodes, "summary": summary}
+    for name, table in tables.items():
+        write_table(output / f"{name}.csv", table)
+    plots = _plots(summary, runs[0], output)
+    print(f"Table: {', '.join(str(output / f'{name}.csv') for name in tables)}")
+    print(f"Plot: {', '.join(map(str, plots))}")
     if options.filmstrip:
         shown: dict[str, Any] = {name: [entry.neutral] for name, entry in DISTURBANCES.items()}
         name, worst = _worst(values)

@@ -1,7 +1,7 @@
 """L1 adaptive control around learned dynamics.
 
 The core is pure (:func:`step`, :func:`augment`); :class:`L1Transform` and :class:`L1Controller`
-put it into an environment or behind a policy.
+put it into an environment or behind a policy. :class:`OracleTransform` bounds what they can do.
 """
 
 from torchrl_l1.control.affine import (
@@ -17,6 +17,7 @@ from torchrl_l1.control.controller import L1Controller
 from torchrl_l1.control.jacobian import ActionJacobian, DynamicsModel
 from torchrl_l1.control.law import step
 from torchrl_l1.control.least_squares import solve_matched
+from torchrl_l1.control.oracle import OracleTransform
 from torchrl_l1.control.state import L1Diagnostics, L1State, ResidualStatistics, init
 from torchrl_l1.control.transform import L1Transform
 
@@ -31,6 +32,7 @@ __all__ = [
     "L1Diagnostics",
     "L1State",
     "L1Transform",
+    "OracleTransform",
     "ResidualStatistics",
     "affinize",
     "augment",

@@ -11,7 +11,10 @@ from omegaconf import OmegaConf
 
 from torchrl_l1.algorithms import Algorithm
 from torchrl_l1.algorithms.collection import (
+    ORACLE,
     Collection,
+    episode_lengths,
+    episode_returns,
     first_episodes,
     return_metrics,
     signal_metrics,
@@ -107,8 +110,27 @@ def evaluate(
 
     Every condition sees the same resets and the same random numbers. Model and policy are
     those of the run's last checkpoint. ``own_l1`` is 1 where the controller is the one that the
-    run was trained with, else 0; ``epsilon`` and ``alpha`` hold what the condition sets. Where an
-    algorithm has several stages, ``stage`` names the tested one.
+    run was trained with, else 0; ``epsilon`` and ``alpha`` hold what the condition sets, and
+    ``steps_mean`` is the mean length of the episodes. Where an algorithm has several stages,
+    ``stage`` names the tested one.
+
+    Raises:
+        ValueError: for a stage that the run has not, before anything is evaluated.
+    """
+    for row, _ in evaluate_episodes(trained, cells, episodes, seed):
+        yield row
+
+
+def evaluate_episodes(
+    trained: TrainedRun,
+    cells: Sequence[Condition],
+    episodes: int,
+    seed: int = 0,
+) -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
+    """As :func:`evaluate`, each row with those of its single episodes.
+
+    Their columns are those of the condition, the run, and ``episode``, ``return`` and ``steps``,
+    the length of the episode. Episodes of one number start from the same reset in all conditions.
 
     Raises:
         ValueError: for a stage that the run has not, before anything is evaluated.
@@ -116,21 +138,36 @@ def evaluate(
     for cell in [replace(cell, stage=trained.stage(cell.stage)) for cell in cells]:
         collection = make_collection(trained, cell, episodes)
         data = collection.evaluate(seed, deterministic=cell.policy == "deterministic")
-        yield {
+        place = {
             "run": str(trained.path),
             "training_seed": trained.recipe.seed,
             **_columns(trained, cell),
-            "own_l1": int(
-                same_controller(_tested_l1(trained, cell), trained.recipe.l1, trained.recipe.task)
-            ),
+        }
+        returns, steps = episode_returns(data).tolist(), episode_lengths(data).tolist()
+        row = {
+            **place,
+            "own_l1": int(_is_own(trained, cell)),
             **return_metrics(data),
+            "steps_mean": sum(steps) / len(steps),
             **signal_metrics(first_episodes(data)),
         }
+        yield (
+            row,
+            [
+                {**place, "episode": number, "return": value, "steps": length}
+                for number, (value, length) in enumerate(zip(returns, steps, strict=True))
+            ],
+        )
+
+
+def episodes_file(table: Path) -> Path:
+    """Where the rows of single episodes are that belong to a table in ``RUN_DIR/evaluations``."""
+    return table.parent / "episodes" / table.name
 
 
 def make_collection(trained: TrainedRun, cell: Condition, episodes: int) -> Collection:
     """The environments of one condition around the frozen policy and model."""
-    settings = _tested_l1(trained, cell)
+    settings = None if cell.l1 == ORACLE else _tested_l1(trained, cell)
     disturbances = {DISTURBANCES[name].setting: value for name, value in cell.disturbances.items()}
     perturbation = Perturbation(**group_setting("noise", cell.noise), **disturbances)
     return Collection(
@@ -138,7 +175,7 @@ def make_collection(trained: TrainedRun, cell: Condition, episodes: int) -> Coll
         episodes,
         trained.algorithm.policies[trained.stage(cell.stage)],
         trained.algorithm.acting_dynamics,
-        l1_config(settings, trained.recipe.task),
+        ORACLE if settings is None else l1_config(settings, trained.recipe.task),
         perturbation,
         trained.recipe.horizon,
     )
@@ -149,6 +186,13 @@ def _columns(trained: TrainedRun, cell: Condition) -> dict[str, Any]:
     if not trained.algorithm.facts.named_stages:
         del columns["stage"]  # there is no choice, and nothing to say
     return columns
+
+
+def _is_own(trained: TrainedRun, cell: Condition) -> bool:
+    """Whether the controller of a test is the one that the run was trained with."""
+    if cell.l1 == ORACLE:
+        return False
+    return same_controller(_tested_l1(trained, cell), trained.recipe.l1, trained.recipe.task)
 
 
 def _tested_l1(trained: TrainedRun, cell: Condition) -> L1Settings:

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
 from functools import cache
 from typing import Any
 
+from torchrl_l1.algorithms.collection import ORACLE
 from torchrl_l1.experiment.recipes import group_options, group_setting
 from torchrl_l1.experiment.settings import L1Settings, l1_config
+
+OFF = "off"
+"""The option without L1."""
+
+UNTUNED = (OFF, ORACLE)
+"""What a test may name in place of a controller that epsilon and alpha could tune."""
 
 # What runs are tuned by; it makes no other controller.
 _TUNED = ("enabled", "epsilon", "compile")
@@ -35,6 +42,21 @@ def l1_option(name: str) -> L1Settings:
         ValueError: if it does not exist; the message lists those that do.
     """
     return L1Settings(**group_setting("l1", name))
+
+
+def check_tested(names: Iterable[str]) -> None:
+    """Refuse what frozen policies cannot be tested with.
+
+    Args:
+        names: options of the recipe group ``l1``, or the oracle, which trains no run.
+
+    Raises:
+        ValueError: for any other name; the message lists those that there are.
+    """
+    there = [*group_options("l1"), ORACLE]
+    for name in names:
+        if name not in there:
+            raise ValueError(f"unknown l1 setting {name!r}; there are {', '.join(there)}")
 
 
 def filter_gain(settings: L1Settings, task: str) -> float:
@@ -91,7 +113,7 @@ def closest_option(settings: L1Settings, task: str, *, by_filter: bool = True) -
         'off'
     """
     if not settings.enabled:
-        return "off"
+        return OFF
 
     def distance(option: str) -> tuple[int, bool, bool]:
         found = departures(settings, option, task)
@@ -138,7 +160,8 @@ def check_tuning(epsilon: Sequence[float], alpha: Sequence[float], prefix: str =
     """Refuse values that no controller can be tested with.
 
     Args:
-        epsilon: tolerances of the switching law.
+        epsilon: tolerances of the switching law; with 0 the affine model sits at the policy's
+            action in every step.
         alpha: gains of the filter per step.
         prefix: what stands before the name of an option where the user writes it.
 
@@ -146,8 +169,8 @@ def check_tuning(epsilon: Sequence[float], alpha: Sequence[float], prefix: str =
         ValueError: naming the option and the value.
     """
     for value in epsilon:
-        if not (value > 0 and math.isfinite(value)):
-            raise ValueError(f"{prefix}epsilon must be positive and finite, got {value:g}")
+        if not (value >= 0 and math.isfinite(value)):
+            raise ValueError(f"{prefix}epsilon must be finite and not negative, got {value:g}")
     for value in alpha:
         if not 0 < value <= 1:
             raise ValueError(f"{prefix}alpha must be above 0 and at most 1, got {value:g}")

@@ -12,12 +12,41 @@ from dataclasses import dataclass, field, fields
 from itertools import product
 from typing import Any
 
+import torch
+
+from torchrl_l1.algorithms.collection import ORACLE
 from torchrl_l1.algorithms.facts import KINDS
-from torchrl_l1.envs import DISTURBANCES
-from torchrl_l1.experiment.l1_options import check_tuning, controller_label
+from torchrl_l1.envs import DISTURBANCES, ActuatorBias, ActuatorGain
+from torchrl_l1.experiment.l1_options import OFF, UNTUNED, check_tuning, controller_label
 from torchrl_l1.experiment.settings import SCHEMAS
 
+# SHIM: until torchrl_l1.envs exports SUITES, suite and transforms that can compensate().
+_LEVELS: dict[str, dict[str, tuple[float, ...]]] = {
+    "bias": {"quick": (0.5,), "full": (0.25, 0.5, 1.0)},
+    "gain": {"quick": (0.6,), "full": (0.4, 0.6, 1.4)},
+}
+SUITES = ("quick", "full")
+
+
+def suite(name: str) -> list[dict[str, float]]:
+    """The cells of a suite."""
+    levels = [{what: v} for what, of in _LEVELS.items() for v in of[name]]
+    return [{}, *levels]
+
+
+def _undo_gain(action: torch.Tensor, gain: torch.Tensor) -> torch.Tensor:
+    return action / torch.where(gain == 0, torch.ones_like(gain), gain)
+
+
+for _kind, _undo in ((ActuatorBias, torch.sub), (ActuatorGain, _undo_gain)):
+    if not hasattr(_kind, "compensate"):
+        _kind.compensate = lambda self, action, _undo=_undo: _undo(action, self.value.to(action))
+# End of the shim.
+
 _STAGES = [stage.name for one in SCHEMAS.values() for stage in one.builds.facts.named_stages]
+
+SUITE_L1 = (OFF, "paper", ORACLE)
+"""Options of ``l1`` that a suite is tested with where none are given."""
 
 # Key of the metadata of a field.
 _AXIS = "axis"
@@ -59,7 +88,7 @@ class Condition:
     """One cell: which controller, noise, disturbances and policy, and how this acts.
 
     Attributes:
-        l1: option of the ``l1`` group.
+        l1: option of the ``l1`` group, or ``oracle``.
         noise: option of the ``noise`` group.
         disturbances: value of each of :data:`~torchrl_l1.envs.DISTURBANCES`, by name; those that
             are not given are neutral.
@@ -79,7 +108,11 @@ class Condition:
 'epsilon': 0.3, 'alpha': None, 'stage': None}
     """
 
-    l1: str = _varied(str, "settings of the l1 group", ("off", "paper"))
+    l1: str = _varied(
+        str,
+        f"settings of the l1 group, or {ORACLE}, which is told the matched disturbances",
+        (OFF, "paper"),
+    )
     noise: str = _varied(str, "settings of the noise group", ("none",), default="none")
     disturbances: Mapping[str, float] = field(default_factory=dict, hash=False)
     policy: str = _varied(
@@ -140,50 +173,105 @@ def axes() -> list[Axis]:
     return found
 
 
-def conditions(**values: Sequence[Any]) -> list[Condition]:
+def conditions(of_suite: str | None = None, **values: Sequence[Any]) -> list[Condition]:
     """Every combination of controller, noise, stage and policy with each single disturbance.
 
     Disturbances vary one at a time: the values of the first, then those of each other that are
-    not neutral. Every controller but ``off`` is tested with each ``epsilon`` and each ``alpha``;
-    without values, as it is. Without a ``stage``, the last one's policy is tested.
+    not neutral; or they are those of a suite. Every controller but ``off`` and ``oracle`` is
+    tested with each ``epsilon`` and each ``alpha``; without values, as it is. Without a ``stage``,
+    the last one's policy is tested.
 
     Args:
+        of_suite: name of a suite, whose cells stand in place of the values of disturbances.
         **values: by the names of :func:`axes`; those of the axis where none are given.
 
     Raises:
-        ValueError: for any other name.
+        ValueError: for any other name, or for disturbances beside a suite.
 
     Examples:
         >>> cells = conditions(epsilon=[0.3, 1.0], policy=["stochastic"])
         >>> [cell.controller for cell in cells]
         ['off', 'paper epsilon=0.3', 'paper epsilon=1']
+        >>> len(conditions("quick", l1=["off"], policy=["stochastic"])) == len(suite("quick"))
+        True
     """
     every = {axis.name: axis.values for axis in axes()}
     _check_names(values, every, "value to vary")
     given = {**every, **values}
-    first = next(iter(DISTURBANCES))
-    disturbances = [
-        {name: value}
-        for name, entry in DISTURBANCES.items()
-        for value in given[name]
-        if name == first or value != entry.neutral
-    ]
+    check_suite(of_suite, given)
+    disturbances = _one_at_a_time(given) if of_suite is None else suite(of_suite)
     tunings = list(product(given["epsilon"] or (None,), given["alpha"] or (None,)))
     cells = product(
         given["stage"] or (None,), given["policy"], given["noise"], disturbances, given["l1"]
     )
     return list(
         dict.fromkeys(
-            Condition(l1, noise, disturbed, policy, epsilon, alpha, stage)
-            for stage, policy, noise, disturbed, l1 in cells
-            for epsilon, alpha in (tunings if l1 != "off" else [(None, None)])
+            Condition(l1, noise, disturbance, policy, epsilon, alpha, stage)
+            for stage, policy, noise, disturbance, l1 in cells
+            for epsilon, alpha in ([(None, None)] if l1 in UNTUNED else tunings)
         )
     )
 
 
+def _one_at_a_time(given: Mapping[str, Sequence[float]]) -> list[dict[str, float]]:
+    first = next(iter(DISTURBANCES))
+    return [
+        {name: value}
+        for name, entry in DISTURBANCES.items()
+        for value in given[name]
+        if name == first or value != entry.neutral
+    ]
+
+
+def check_suite(name: str | None, values: Mapping[str, Sequence[Any]], prefix: str = "") -> None:
+    """Refuse a suite that there is not, or one beside values of a disturbance.
+
+    Args:
+        name: of the suite; ``None`` is none.
+        values: by the names of :func:`axes`.
+        prefix: what stands before a name where the user writes it.
+
+    Raises:
+        ValueError: naming suite and disturbance.
+    """
+    if name is None:
+        return
+    if name not in SUITES:
+        raise ValueError(f"unknown {prefix}suite {name!r}; there are {', '.join(SUITES)}")
+    for what, entry in DISTURBANCES.items():
+        if any(value != entry.neutral for value in values[what]):
+            raise ValueError(
+                f"{prefix}suite and {prefix}{what} both say which disturbances there are; "
+                "leave one of them out"
+            )
+
+
+def disturbed(columns: Mapping[str, Any]) -> dict[str, float]:
+    """Those disturbances among the columns of a condition that are not neutral, with values.
+
+    A disturbance that there is no column of is neutral.
+    """
+    return {
+        name: float(columns[name])
+        for name, entry in DISTURBANCES.items()
+        if float(columns.get(name, entry.neutral)) != entry.neutral
+    }
+
+
 def undisturbed(columns: Mapping[str, Any]) -> bool:
     """Whether the columns of a condition hold the neutral value of every disturbance."""
-    return all(columns[name] == entry.neutral for name, entry in DISTURBANCES.items())
+    return not disturbed(columns)
+
+
+def disturbance_words(columns: Mapping[str, Any]) -> str:
+    """The disturbances of a condition, as tables and charts name it.
+
+    Examples:
+        >>> disturbance_words({"bias": 0.5, "gain": 1.0}), disturbance_words({})
+        ('bias 0.5', 'undisturbed')
+    """
+    found = [f"{name} {value:g}" for name, value in disturbed(columns).items()]
+    return ", ".join(found) or "undisturbed"
 
 
 def check_values(values: Mapping[str, Sequence[Any]], prefix: str = "") -> None:

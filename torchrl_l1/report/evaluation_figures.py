@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,8 @@ _AXES = {
 }
 # The first colour is that of the line without L1.
 _COLORS = 6
+# Panels of disturbances side by side.
+_MOST_ACROSS = 4
 _MARKERS = "osD^vP"
 
 
@@ -124,7 +127,8 @@ def plot_disturbances(
 
     There is a panel per stage, policy, noise and disturbance for each of ``shown``, one below the
     other, with its line and band. Returns of training seeds differ more from each other than L1
-    off from L1 on, so by default the difference, policy by policy, stands below each return.
+    off from L1 on, so by default the difference, policy by policy, stands below each return. Of
+    many disturbances only those that are tested at several magnitudes have panels.
 
     Args:
         rows: tested under several values of disturbances; in a report, of one cell and stage of
@@ -142,31 +146,38 @@ def plot_disturbances(
     for stage, policy, noise in dict.fromkeys(map(_tested, rows)):
         mine = [row for row in rows if _tested(row) == (stage, policy, noise)]
         varied = _varied(mine)
+        if len(varied) > _MOST_ACROSS:
+            varied = {k: v for k, v in varied.items() if len({row[k] for row in v}) > 2}
         if not varied and always:
             varied = {next(iter(DISTURBANCES)): mine}
         name = _panel_title(algorithm.acting(policy, stage), noise)
         found += [(name, what, chosen) for what, chosen in varied.items()]
     if not found:
         return None
-    # All panels of a column vary the same; returns and differences take turns down the rows.
-    # A single disturbance with nothing below it has room for two beside each other.
-    columns = max(len({what for _, what, _ in found}), 2 // len(shown))
-    groups = [found[i : i + columns] for i in range(0, len(found), columns)]
-    panels = [
-        (name, what, chosen, value)
-        for group in groups
-        for value in shown
-        for name, what, chosen in group
-        if any(value.line in row for row in chosen)
-    ]
-    figure, axes = grid(len(panels), columns=columns, width=5.2, height=3.2)
+    # Returns and differences take turns down the rows. A single disturbance with nothing below it
+    # has room for two beside each other.
+    columns = min(max(len({what for _, what, _ in found}), 2 // len(shown)), _MOST_ACROSS)
+    panels: list[tuple[str, str, list[Row], Columns] | None] = []
+    for group in (found[i : i + columns] for i in range(0, len(found), columns)):
+        for value in shown:
+            drawn = [(*one, value) for one in group if any(value.line in row for row in one[2])]
+            panels += [*drawn, *[None] * (columns - len(drawn))] if drawn else []
+    while panels[-1] is None:
+        panels.pop()
+    figure, every = grid(len(panels), columns=columns, width=5.2, height=3.2)
+    axes, returns = [], []
     scaled: list[Sequence[float]] = []
-    for axis, (name, what, chosen, value) in zip(axes, panels, strict=True):
-        drawn = _draw_disturbance(axis, what, chosen, value)
+    for axis, panel in zip(every, panels, strict=True):
+        if panel is None:
+            axis.set_visible(False)
+            continue
+        name, what, chosen, value = panel
+        limits = _draw_disturbance(axis, what, chosen, value)
         axis.set_title(name, fontsize=10)
+        axes.append(axis)
         if value is shown[0]:
-            scaled += drawn
-    returns = [axis for axis, panel in zip(axes, panels, strict=True) if panel[-1] is shown[0]]
+            returns.append(axis)
+            scaled += limits
     fit_scale(returns, scaled)
     figure.suptitle(heading, fontsize=11)
     legend_below(figure, axes)
@@ -266,6 +277,7 @@ def plot_tuning(rows: Sequence[Row], heading: str, file: Path) -> Path | None:
     if len(values[x]) < 2:
         return None
     tuned = [row for row in tuned if row[x] is not None]
+    places = _along(values[x])
     found = sorted(
         set(map(_condition, tuned)), key=lambda cell: (noise_order(cell[0]), *_distance(cell[1:]))
     )
@@ -274,7 +286,7 @@ def plot_tuning(rows: Sequence[Row], heading: str, file: Path) -> Path | None:
     with_switches = any("switches_per_1000_steps" in row for row in first)
     figure, axes = grid(len(found) + with_switches, columns=3, width=4.4, height=3.5)
     if with_switches:
-        _draw(axes[0], first, lines, x, "switches_per_1000_steps")
+        _draw(axes[0], first, lines, x, "switches_per_1000_steps", places)
         axes[0].set_ylabel("switches per 1000 steps")
         axes[0].set_title(f"switches, {_words(found[0])}", fontsize=10)
         top = max(1.0, axes[0].get_ylim()[1])
@@ -282,7 +294,7 @@ def plot_tuning(rows: Sequence[Row], heading: str, file: Path) -> Path | None:
     for axis, condition in zip(axes[with_switches:], found, strict=True):
         shown = [row for row in tuned if _condition(row) == condition]
         off = [r for r in rows if r["l1"] == BASELINE and _condition(r) == condition]
-        _draw(axis, shown, lines, x, "return_mean")
+        _draw(axis, shown, lines, x, "return_mean", places)
         for row in off:
             axis.axhline(
                 row["return_mean"], color=color(0, BASELINE), linestyle="--",
@@ -294,8 +306,7 @@ def plot_tuning(rows: Sequence[Row], heading: str, file: Path) -> Path | None:
         axis.set_title(f"return, {_words(condition)}", fontsize=10)
     for axis in axes:
         axis.set_xscale("log")
-        ticks = sorted(values[x])
-        axis.set_xticks(ticks, [f"{value:g}" for value in ticks])
+        axis.set_xticks(list(places.values()), [f"{value:g}" for value in places])
         axis.xaxis.set_minor_locator(NullLocator())
         axis.set_xlabel(_AXES[x])
         axis.grid(alpha=0.3)
@@ -320,9 +331,10 @@ def _draw(
     lines: Mapping[tuple[str, float | None], str],
     x: str,
     y: str,
+    places: Mapping[float, float],
 ) -> None:
     other = "alpha" if x == "epsilon" else "epsilon"
-    ticks = np.unique([row[x] for row in rows])
+    ticks = [place for value, place in places.items() if any(row[x] == value for row in rows)]
     # Side by side, so that intervals do not hide each other; switches have none.
     widest = 0.25 * np.diff(np.log(ticks)).min(initial=1.0) / max(len(lines) - 1, 1)
     step = min(widest, 0.07) * (y == "return_mean")
@@ -333,7 +345,7 @@ def _draw(
         marker = _MARKERS[index % len(_MARKERS)]
         aside = np.exp(step * (index - (len(lines) - 1) / 2))
         axis.plot(
-            [aside * row[x] for row in mine],
+            [aside * places[row[x]] for row in mine],
             [row[y] for row in mine],
             f"{marker}-",
             color=shade,
@@ -342,12 +354,25 @@ def _draw(
         )
         limits = [row for row in mine if y == "return_mean" and "return_low" in row]
         axis.vlines(
-            [aside * row[x] for row in limits],
+            [aside * places[row[x]] for row in limits],
             [row["return_low"] for row in limits],
             [row["return_high"] for row in limits],
             color=shade,
             alpha=0.6,
         )
+
+
+def _along(values: Iterable[float]) -> dict[float, float]:
+    """Where values are on a logarithmic axis: 0 is one step below the least of the others.
+
+    Examples:
+        >>> _along([1.0, 0.0, 0.5])
+        {0.0: 0.25, 0.5: 0.5, 1.0: 1.0}
+    """
+    ordered = sorted(set(values))
+    least, following = [*(value for value in ordered if value > 0), math.inf][:2]
+    step = following / least if math.isfinite(following) else 10.0
+    return {value: value if value > 0 else least / step for value in ordered}
 
 
 def _condition(row: Row) -> tuple[Any, ...]:

@@ -2,34 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from statistics import median
 from typing import Any
 
+from torchrl_l1.algorithms.collection import ORACLE
 from torchrl_l1.envs import DISTURBANCES
-from torchrl_l1.experiment.l1_options import controller_label
+from torchrl_l1.experiment.l1_options import UNTUNED, controller_label
+from torchrl_l1.experiment.matrix import disturbance_words
+from torchrl_l1.report.identity import BASELINE
 from torchrl_l1.report.page import grouped, markdown
+from torchrl_l1.report.recovery import (
+    FEW_DISTURBANCES,
+    controllers,
+    recovered_text,
+    recovery_columns,
+    varied,
+)
 from torchrl_l1.report.style import arm_label
 
 Row = Mapping[str, Any]
+Key = tuple[Any, ...]
 
 
-def summarize(rows: Sequence[Row]) -> list[dict[str, Any]]:
+def summarize(rows: Sequence[Row], episodes: Sequence[Row] = ()) -> list[dict[str, Any]]:
     """Median, lowest and highest mean return over the training seeds, per condition.
 
     A controller is named by its option and the values that the test has set. Only where rows
-    have a ``stage`` has the summary. Disturbances that rows have no column of are neutral.
+    have a ``stage`` has the summary. Disturbances that rows have no column of are neutral. Where
+    an oracle was tested, too, there are the columns of
+    :func:`~torchrl_l1.report.recovery.recovery_columns`.
 
     Args:
         rows: of :func:`~torchrl_l1.experiment.evaluate.evaluate`.
+        episodes: the rows of their single episodes, of
+            :func:`~torchrl_l1.experiment.evaluate.evaluate_episodes`.
     """
-    neutral = {name: entry.neutral for name, entry in DISTURBANCES.items()}
-    keys = ("stage", "policy", "noise", *neutral, "l1")
-    groups: dict[tuple[Any, ...], list[Row]] = {}
+    keys = ("stage", "policy", "noise", *DISTURBANCES, "l1")
+    groups: dict[Key, list[Row]] = {}
     for row in rows:
-        name = controller_label(row["l1"], row.get("epsilon"), row.get("alpha"))
-        cell = {"stage": None, **neutral, **row, "l1": name}
-        groups.setdefault(tuple(cell[key] for key in keys), []).append(row)
+        groups.setdefault(_key(row, keys), []).append(row)
+    singly: dict[Key, dict[Hashable, list[float]]] = {}
+    for row in episodes:
+        singly.setdefault(_key(row, keys), {}).setdefault(row["run"], []).append(row["return"])
     summary = []
     for found, members in groups.items():
         returns = [float(row["return_mean"]) for row in members]
@@ -44,8 +59,18 @@ def summarize(rows: Sequence[Row]) -> list[dict[str, Any]]:
         if "l1/switch_rate" in members[0]:
             rates = [float(row["l1/switch_rate"]) for row in members]
             entry["switches_per_1000_steps"] = 1000 * median(rates)
+        if found[-1] not in UNTUNED:
+            which = (BASELINE, found[-1], ORACLE)
+            entry |= recovery_columns(*(singly.get((*found[:-1], l1), {}) for l1 in which))
         summary.append(entry)
     return summary
+
+
+def _key(row: Row, keys: Sequence[str]) -> Key:
+    neutral = {name: entry.neutral for name, entry in DISTURBANCES.items()}
+    name = controller_label(row["l1"], row.get("epsilon"), row.get("alpha"))
+    cell = {"stage": None, **neutral, **row, "l1": name}
+    return tuple(cell[key] for key in keys)
 
 
 def summary_tables(summary: Sequence[Row]) -> str:
@@ -59,11 +84,23 @@ def summary_tables(summary: Sequence[Row]) -> str:
         ]
         seeds = mine[0]["training_seeds"]
         words = ", ".join(filter(None, (stage, f"{policy} policy", f"noise {noise}")))
+        table = _aligned(markdown(summary_lines(mine)))
         blocks.append(
             f"{words}: mean return, median [lowest, highest] of {seeds} "
-            f"training seed{'s' * (seeds > 1)}\n\n{_aligned(markdown(summary_lines(mine)))}"
+            f"training seed{'s' * (seeds > 1)}{_recovered_words(mine)}\n\n{table}"
         )
     return "\n\n".join(blocks)
+
+
+def _recovered_words(summary: Sequence[Row]) -> str:
+    """What recovered is, where there is any; over how many policies its interval is."""
+    policies = max((int(row.get("recovered_policies") or 0) for row in summary), default=0)
+    if not policies:
+        return ""
+    over = "policies and episodes" if policies > 1 else "the episodes of this one policy alone"
+    stars = any(float(row.get("gap") or 0.0) < 0 for row in summary)
+    words = " (*: the disturbance does good, which 1 undoes)" * stars
+    return f"; recovered, with its 95 % interval over {over}{words}"
 
 
 def summary_lines(
@@ -71,22 +108,28 @@ def summary_lines(
 ) -> list[dict[str, str]]:
     """A line per disturbance, with those disturbances that are not neutral; a column per L1.
 
+    Where more than a few disturbances vary, a single column names the one that a line is of.
+
     Args:
         summary: of :func:`summarize`, or its table read again.
         keys: what else tells lines apart, in front.
         digits: significant ones of the returns.
     """
-    disturbed = [
-        name
-        for name, entry in DISTURBANCES.items()
-        if any(float(row.get(name, entry.neutral)) != entry.neutral for row in summary)
-    ]
-    controllers = dict.fromkeys(row["l1"] for row in summary)
+    names = varied(summary)
+    tested = controllers(summary)
+    # Without an oracle there is nothing to say of it.
+    shown = [l1 for l1 in tested if l1 not in UNTUNED] if ORACLE in tested else []
+    neutral = {name: entry.neutral for name, entry in DISTURBANCES.items()}
     lines = []
-    for place, found in grouped(summary, (*keys, *disturbed), "l1"):
-        words = place[: len(keys)], (f"{float(value):g}" for value in place[len(keys) :])
-        line = dict(zip((*keys, *disturbed), (*words[0], *words[1]), strict=True))
-        line |= {arm_label(l1): _with_range(found.get(l1), digits) for l1 in controllers}
+    for place, found in grouped([{**neutral, **row} for row in summary], (*keys, *names), "l1"):
+        line = dict(zip(keys, place, strict=False))
+        values = dict(zip(names, map(float, place[len(keys) :]), strict=True))
+        if len(names) > FEW_DISTURBANCES:
+            line["disturbance"] = disturbance_words(values)
+        else:
+            line |= {name: f"{value:g}" for name, value in values.items()}
+        line |= {arm_label(l1): _with_range(found.get(l1), digits) for l1 in tested}
+        line |= {f"{arm_label(l1)} recovered": recovered_text(found.get(l1, {})) for l1 in shown}
         lines.append(line)
     return lines
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from torchrl_l1.algorithms.collection import ORACLE
 from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.matrix import undisturbed
@@ -30,10 +31,20 @@ from torchrl_l1.report.page import (
 )
 from torchrl_l1.report.published import published_cell
 from torchrl_l1.report.reading import Evaluation, condition_columns
+from torchrl_l1.report.recovery import (
+    controllers,
+    disturbance_cells,
+    is_about_robustness,
+    recovered_text,
+    recovery_columns,
+    recovery_section,
+    training_cells,
+    varied,
+)
 from torchrl_l1.report.runs import Run
 from torchrl_l1.report.statistics import difference_summary, mean_summary
 from torchrl_l1.report.study import Study, noise_order, variant_text
-from torchrl_l1.report.style import arm_label, named, noise_words, title
+from torchrl_l1.report.style import arm_label, named
 
 Row = Mapping[str, Any]
 Key = tuple[Any, ...]
@@ -55,7 +66,11 @@ def evaluation_sections(page: Page, study: Study) -> None:
         if name == "ablation":
             rows = ablation_rows(rows)
         if rows:
-            special.get(name, _other(name))(page, study.facts, rows)
+            robust = is_about_robustness(rows)
+            other = _robustness(name) if robust else _other(name)
+            special.get(name, other)(page, study.facts, rows)
+            if robust and name in special and name != "ablation":
+                recovery_section(page, study.facts, name, rows)
             _tuning(page, study.facts, name, rows)
             page.csv(name, rows)
 
@@ -97,26 +112,49 @@ def _ablation(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> Non
 def _disturbances(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> None:
     page.heading(
         "Disturbances",
-        f"Return of frozen policies against {_disturbances_in_words()} that the model "
+        f"Return of frozen policies against {_disturbances_in_words(rows)} that the model "
         "has never seen: mean over training seeds, with its 95 % interval as a band; below it, the "
         "difference to the same policies without L1 with the interval of its mean.",
     )
-    for heading, words, chosen in _training_cells(rows):
+    _against_magnitudes(page, algorithm, "disturbances", rows)
+
+
+def _against_magnitudes(
+    page: Page, algorithm: AlgorithmFacts, name: str, rows: Sequence[Row]
+) -> None:
+    for heading, words, chosen in training_cells(rows):
         stage = _stage(chosen[0])
         heading += f", stage {stage}" * bool(stage)
-        file = page.file("disturbances", *words)
+        file = page.file(name, *words)
         drawn = plot_disturbances(chosen, named(page.name, heading), file, algorithm)
         page.figure(drawn, heading)
 
 
-def _disturbances_in_words() -> str:
-    """All that there are.
+def _robustness(name: str) -> Section:
+    def section(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> None:
+        page.heading(
+            "Robustness" if name == "robustness" else f"Evaluation `{name}`",
+            "Frozen policies under one disturbance at a time that neither they nor their models "
+            "have seen: mean ± standard deviation over training seeds.",
+        )
+        recovery_section(page, algorithm, name, rows)
+        page.text(
+            "Against the magnitude, where there are several: means over training seeds with their "
+            "95 % intervals as bands; below, the differences to the same policies without L1."
+        )
+        _against_magnitudes(page, algorithm, name, rows)
+
+    return section
+
+
+def _disturbances_in_words(rows: Sequence[Row]) -> str:
+    """Those that vary in a table.
 
     Examples:
-        >>> _disturbances_in_words()
+        >>> _disturbances_in_words([{"bias": 0.5, "gain": 1.0}, {"bias": 0.0, "gain": 0.6}])
         'an actuator bias and an actuator gain'
     """
-    words = [entry.words for entry in DISTURBANCES.values()]
+    words = [DISTURBANCES[name].words for name in varied(rows)] or ["disturbance"]
     *rest, last = (f"a{'n' * (text[0] in 'aeiou')} {text}" for text in words)
     return " and ".join(filter(None, (", ".join(rest), last)))
 
@@ -124,7 +162,7 @@ def _disturbances_in_words() -> str:
 def _tuning(page: Page, algorithm: AlgorithmFacts, name: str, rows: Sequence[Row]) -> None:
     """A figure per training cell, where the tests go through values of the controller."""
     explained = False
-    for heading, words, chosen in _training_cells(rows):
+    for heading, words, chosen in training_cells(rows):
         policy, swept = tuning_rows(chosen)
         acting = algorithm.acting(policy, _stage(chosen[0]))
         caption = f"{heading}; tested with {acting}" if acting else heading
@@ -138,20 +176,6 @@ def _tuning(page: Page, algorithm: AlgorithmFacts, name: str, rows: Sequence[Row
             )
             explained = True
         page.figure(drawn, caption)
-
-
-def _training_cells(rows: Sequence[Row]) -> Iterator[tuple[str, tuple[str, ...], list[Row]]]:
-    """The rows of each cell and stage of the training, with a heading and the words of a file."""
-
-    def place(row: Row) -> tuple[str, ...]:
-        keys = ("task", "training_noise", "training_l1", "variant")
-        return (*(row[key] for key in keys), _stage(row))
-
-    for cell in dict.fromkeys(map(place, rows)):
-        task, noise, l1, variant, _ = cell
-        heading = f"{title(task)}: trained with {noise_words(noise)} and {arm_label(l1)}"
-        heading += f" ({variant})" * bool(variant)
-        yield heading, cell, [row for row in rows if place(row) == cell]
 
 
 def _other(name: str) -> Section:
@@ -213,7 +237,8 @@ def evaluation_rows(study: Study, name: str) -> list[dict[str, Any]]:
     is equal to ``training_l1`` the policy was tested with the controller of its training;
     another controller of that name is marked. Where the test has set values of the controller,
     ``l1`` names them, and ``option``, ``epsilon`` and ``alpha`` hold them. ``stage`` is there
-    where a test names it.
+    where a test names it, and :func:`~torchrl_l1.report.recovery.recovery_columns` where an
+    oracle was tested, too, and the returns of single episodes are known.
     """
     rows = []
     for cell, runs in study.cells.items():
@@ -236,6 +261,7 @@ def evaluation_rows(study: Study, name: str) -> list[dict[str, Any]]:
                     **_set_values(tests[key][0][1]),
                     **_summary(tests[key]),
                     **_against_baseline(key, tests),
+                    **_against_oracle(key, tests),
                     **_published(runs[0], key),
                 }
             )
@@ -249,13 +275,14 @@ def ablation_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Those rows of an evaluation that the ablation is made of, with the ``phase`` of L1.
 
     The test has the noise of the training and no disturbance, and L1 is on in both phases, in
-    one, or in neither. Where L1 is on in both it is the same L1.
+    one, or in neither. Where L1 is on in both it is the same L1. The oracle is none.
     """
     chosen = []
     for row in rows:
         trained, tested = row["training_l1"], row["l1"]
         on = {trained, tested} - {BASELINE}
-        if undisturbed(row) and row["training_noise"] == row["noise"] and len(on) < 2:
+        same = undisturbed(row) and row["training_noise"] == row["noise"]
+        if same and len(on) < 2 and tested != ORACLE:
             chosen.append({**row, "phase": _l1_in(trained, tested)})
     return sorted(chosen, key=lambda row: L1_IN.index(row["phase"]))
 
@@ -295,6 +322,9 @@ def _summary(tests: Sequence[tuple[Run, Evaluation]]) -> dict[str, Any]:
         "return_values": " ".join(f"{value:.6g}" for value in values),
         **mean,
     }
+    steps = float(np.mean([test.steps_mean for _, test in tests]))
+    if np.isfinite(steps):
+        result["steps_mean"] = steps
     switches = 1000 * float(np.mean([test.switch_rate for _, test in tests]))
     if np.isfinite(switches):
         result["switches_per_1000_steps"] = switches
@@ -312,6 +342,18 @@ def _against_baseline(
     )
 
 
+def _against_oracle(
+    key: Key, tests: Mapping[Key, Sequence[tuple[Run, Evaluation]]]
+) -> dict[str, Any]:
+    if key[0] in (BASELINE, ORACLE):
+        return {}
+
+    def returns(l1: str) -> dict[Hashable, Sequence[float]]:
+        return {run.path: test.returns for run, test in tests.get((l1, *key[1:]), ())}
+
+    return recovery_columns(returns(BASELINE), returns(key[0]), returns(ORACLE))
+
+
 def _published(run: Run, key: Key) -> dict[str, str]:
     row = dict(zip(condition_columns(), key, strict=True))
     what = run.identity
@@ -327,7 +369,7 @@ def _order(key: Key, test: Evaluation) -> Key:
     # By the values, where their texts would put 10 before 3.
     controller = (test.l1, test.epsilon or 0.0, test.alpha or 0.0) if test.tuned else (l1, 0.0, 0.0)
     place = (policy != "stochastic", noise_order(noise), *disturbances)
-    return *place, l1 != BASELINE, controller
+    return *place, (l1 != BASELINE) + (l1 == ORACLE), controller
 
 
 def evaluation_table(rows: Sequence[Row]) -> str:
@@ -337,18 +379,17 @@ def evaluation_table(rows: Sequence[Row]) -> str:
         rows: of one kind of policy and one L1 setting of the training.
     """
     notes = Footnotes()
-    tested = list(dict.fromkeys(row["l1"] for row in rows))
+    tested = controllers(rows)
+    names = varied(rows)
     keys = ("task", "training_noise", "variant", "stage", "noise", *DISTURBANCES)
     lines = []
     for _, found in grouped(rows, keys, "l1"):
         first = next(iter(found.values()))
-        line = _place(first) | {"training seeds": str(first["training_seeds"])}
-        line |= {f"L1 {l1}": return_text(found.get(l1)) for l1 in tested}
-        line |= {
-            f"L1 {l1} less off": difference_text(found.get(l1, {}))
-            for l1 in tested
-            if l1 != BASELINE
-        }
+        line = _place(first, names) | {"training seeds": str(first["training_seeds"])}
+        line |= {arm_label(l1): return_text(found.get(l1)) for l1 in tested}
+        on = [l1 for l1 in tested if l1 != BASELINE]
+        line |= {f"{arm_label(l1)} less off": difference_text(found.get(l1, {})) for l1 in on}
+        line |= {f"{arm_label(l1)} recovered": recovered_text(found.get(l1, {})) for l1 in on}
         line |= {f"paper, L1 {l1}": paper_text(found.get(l1, {}), notes) for l1 in tested}
         lines.append(line)
     return notes.below(markdown(lines))
@@ -360,15 +401,17 @@ def tuning_table(rows: Sequence[Row]) -> str:
     Args:
         rows: of one kind of policy and one L1 setting of the training.
     """
+    names = varied(rows)
     lines = [
         {
-            **_place(row),
+            **_place(row, names),
             "L1": row.get("option", row["l1"]),
             "epsilon": number(row.get("epsilon")),
             "alpha": number(row.get("alpha")),
             "training seeds": str(row["training_seeds"]),
             "return": return_text(row),
             "less off": difference_text(row),
+            "recovered": recovered_text(row),
             "switches per 1000 steps": number(row.get("switches_per_1000_steps")),
         }
         for row in rows
@@ -376,18 +419,20 @@ def tuning_table(rows: Sequence[Row]) -> str:
     return markdown(lines)
 
 
-def _place(row: Row) -> dict[str, str]:
-    """Where a test belongs; what is neutral is left empty."""
+def _place(row: Row, disturbances: Sequence[str]) -> dict[str, str]:
+    """Where a test belongs; what is neutral is left empty.
+
+    Args:
+        row: of the table.
+        disturbances: names of those that vary in the table.
+    """
     return {
         "task": row["task"],
         "training noise": "" if row["training_noise"] == "none" else row["training_noise"],
         "variant": row["variant"],
         "stage": _stage(row),
         "noise": row["noise"],
-        **{
-            name: "" if row[name] == entry.neutral else f"{row[name]:g}"
-            for name, entry in DISTURBANCES.items()
-        },
+        **disturbance_cells(row, disturbances),
     }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import numpy as np
 from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.errors import RunDirectoryError
+from torchrl_l1.experiment.evaluate import episodes_file
 from torchrl_l1.experiment.matrix import Condition
 
 SWITCH_RATE = "l1/switch_rate"
@@ -74,12 +75,16 @@ class Evaluation(Condition):
         own_l1: whether the controller was the one of the training; ``None`` in tables that are
             older than this column.
         switch_rate: switches per step; NaN if unknown or without L1.
+        steps_mean: mean length of the episodes; NaN if unknown.
+        returns: of the single episodes; empty if unknown.
     """
 
     return_mean: float
     episodes: int
     own_l1: bool | None = None
     switch_rate: float = math.nan
+    steps_mean: float = math.nan
+    returns: tuple[float, ...] = ()
 
     @property
     def condition(self) -> tuple[Any, ...]:
@@ -99,22 +104,20 @@ def condition_columns() -> tuple[str, ...]:
 
 
 def read_evaluations(file: Path) -> list[Evaluation]:
-    """The rows of an evaluation; disturbances that it has no column of are neutral."""
-    later = [name for name in DISTURBANCES if name not in _FIRST_DISTURBANCES]
-    there = checked_rows(file, (), optional_words=later) if later else []
-    found = [*_FIRST_DISTURBANCES, *(n for n in later if any(row[n] for row in there))]
-    rows = checked_rows(
-        file,
-        (*found, "return_mean", "episodes"),
-        ("l1", "noise", "policy"),
-        ("own_l1", "epsilon", "alpha", SWITCH_RATE),
-        ("stage",),
-    )
+    """The rows of an evaluation, with the returns of single episodes where these are beside it.
+
+    Disturbances that it has no column of are neutral.
+    """
+    rows = _condition_rows(file, ("return_mean", "episodes"), ("own_l1", SWITCH_RATE, "steps_mean"))
+    singly: dict[tuple[Any, ...], list[float]] = {}
+    episodes = episodes_file(file)
+    for row in _condition_rows(episodes, ("return",)) if episodes.exists() else ():
+        singly.setdefault(_condition_key(row), []).append(row["return"])
     return [
         Evaluation(
             l1=row["l1"],
             noise=row["noise"],
-            disturbances={name: row[name] for name in found},
+            disturbances={name: row[name] for name in DISTURBANCES if name in row},
             policy=row["policy"],
             epsilon=_known(row["epsilon"]),
             alpha=_known(row["alpha"]),
@@ -123,9 +126,33 @@ def read_evaluations(file: Path) -> list[Evaluation]:
             episodes=int(row["episodes"]),
             own_l1=None if math.isnan(row["own_l1"]) else bool(row["own_l1"]),
             switch_rate=row[SWITCH_RATE],
+            steps_mean=row["steps_mean"],
+            returns=tuple(singly.get(_condition_key(row), ())),
         )
         for row in rows
     ]
+
+
+def _condition_rows(
+    file: Path, numbers: Sequence[str], optional: Sequence[str] = ()
+) -> list[dict[str, Any]]:
+    """Rows with the columns of conditions and others; disturbances as far as there are any."""
+    later = [name for name in DISTURBANCES if name not in _FIRST_DISTURBANCES]
+    there = checked_rows(file, (), optional_words=later) if later else []
+    found = [*_FIRST_DISTURBANCES, *(n for n in later if any(row[n] for row in there))]
+    return checked_rows(
+        file,
+        (*found, *numbers),
+        ("l1", "noise", "policy"),
+        ("epsilon", "alpha", *optional),
+        ("stage",),
+    )
+
+
+def _condition_key(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    disturbances = (row.get(name) for name in DISTURBANCES)
+    tuning = (_known(row["epsilon"]), _known(row["alpha"]))
+    return row["l1"], row["noise"], *disturbances, row["policy"], *tuning, row["stage"]
 
 
 def one_policy(tests: Sequence[Evaluation]) -> list[Evaluation]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -135,6 +136,98 @@ def difference_summary(differences: Sequence[float]) -> dict[str, Any]:
         result |= {"iqm_low": interval.low, "iqm_high": interval.high}
     result["differences"] = " ".join(f"{value:.6g}" for value in differences)
     return result
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What a controller gives back of what an oracle would.
+
+    Attributes:
+        gap: mean return with the oracle less that without control.
+        gap_interval: of the gap.
+        share: that part of the gap by which the controller is better than none: 1 is as good as
+            the oracle, 0 as no control. ``None`` where the interval of the gap includes 0: there
+            is nothing to recover, or too little to be told from chance.
+        interval: of the share.
+        policies: how many policies the intervals are over; with one, they are over its episodes
+            alone and say nothing of other trainings.
+    """
+
+    gap: float
+    gap_interval: Interval
+    share: float | None
+    interval: Interval | None
+    policies: int
+
+
+def recovered(
+    off: Sequence[np.ndarray], on: Sequence[np.ndarray], oracle: Sequence[np.ndarray]
+) -> Recovery:
+    r"""The share :math:`(\bar R_{on} - \bar R_{off}) / (\bar R_{oracle} - \bar R_{off})`.
+
+    Its 95 % interval is that of a paired percentile bootstrap in two stages: policies are drawn
+    with replacement, and within each one its episodes; what is drawn counts for all three. Every
+    policy has the same weight. The resampling has a fixed seed.
+
+    Where the disturbance does a policy good, the gap is negative, and 1 still means that all of
+    it is undone.
+
+    Args:
+        off: returns of the episodes ``(E,)`` of each policy without control.
+        on: with the controller, of the same policies and from the same resets.
+        oracle: with the oracle.
+
+    Raises:
+        ValueError: if there are no episodes, or not the same number of them.
+
+    Examples:
+        >>> off, oracle = np.array([0.0, 1.0, 2.0]), np.array([10.0, 11.0, 12.0])
+        >>> recovery = recovered([off], [(off + oracle) / 2], [oracle])
+        >>> round(recovery.share, 6), round(recovery.gap_interval.low, 6)
+        (0.5, 10.0)
+        >>> recovered([off], [oracle], [off]).share is None
+        True
+    """
+    sizes = tuple(map(len, off))
+    if not sizes or 0 in sizes or {sizes} != {tuple(map(len, one)) for one in (on, oracle)}:
+        raise ValueError("recovered() needs the same episodes of the same policies three times")
+    weights = _paired_weights(sizes)
+    plain, gain, gap = (
+        weights @ np.concatenate([np.asarray(one, dtype=np.float64) for one in returns])
+        for returns in (off, on, oracle)
+    )
+    gain, gap = gain - plain, gap - plain
+    gap_interval = _percentiles(gap[1:])
+    found = Recovery(float(gap[0]), gap_interval, None, None, len(sizes))
+    if gap_interval.low <= 0 <= gap_interval.high:
+        return found
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = gain / gap
+    interval = _percentiles(shares[1:][np.isfinite(shares[1:])])
+    return replace(found, share=float(shares[0]), interval=interval)
+
+
+@cache
+def _paired_weights(sizes: tuple[int, ...]) -> np.ndarray:
+    """Weights of all episodes: in the first row of the mean, in the others of resampled ones.
+
+    Args:
+        sizes: number of episodes of each policy.
+    """
+    rng = np.random.default_rng(0)
+    policies = len(sizes)
+    times = rng.multinomial(policies, [1 / policies] * policies, size=_RESAMPLES)
+    blocks = []
+    for index, size in enumerate(sizes):
+        # A policy that is drawn k times brings k resamples of its episodes.
+        drawn = rng.multinomial(times[:, index] * size, [1 / size] * size)
+        blocks.append(np.vstack([np.ones((1, size)), drawn]) / (size * policies))
+    return np.hstack(blocks)
+
+
+def _percentiles(values: np.ndarray) -> Interval:
+    low, high = np.quantile(values, [0.025, 0.975])
+    return Interval(float(low), float(high))
 
 
 def _bootstrap(

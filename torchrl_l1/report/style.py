@@ -16,10 +16,12 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from torchrl_l1.algorithms.collection import ORACLE
 from torchrl_l1.report.identity import BASELINE
 
 # Okabe and Ito: told apart with any colour vision. Grey is kept for the authors' curves.
 _ARMS = {"off": "#D55E00", "paper": "#0072B2", "reference": "#009E73", "slow": "#CC79A7"}
+_ARMS[ORACLE] = "#000000"
 _CYCLE = ("#D55E00", "#0072B2", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#000000")
 
 _NOISES = {
@@ -36,7 +38,14 @@ def color(index: int, arm: str | None = None) -> str:
 
 
 def arm_label(arm: str) -> str:
-    """An arm's name in a legend."""
+    """An arm's name in a legend.
+
+    Examples:
+        >>> arm_label("off"), arm_label("paper"), arm_label("oracle")
+        ('L1 off', 'L1 paper', 'oracle')
+    """
+    if arm == ORACLE:
+        return arm
     return "L1 off" if arm == BASELINE else f"L1 {arm}"
 
 
@@ -118,13 +127,18 @@ def grid(panels: int, columns: int, width: float, height: float) -> tuple[Figure
     return figure, flat[:panels]
 
 
+def reaches_far_below(values: np.ndarray, below: float = -5.0) -> bool:
+    """Whether returns lie between 0 and far below, so that only a logarithm shows them all."""
+    return bool(values.size and -0.5 < values.max() <= 0 and values.min() < below)
+
+
 def fit_scale(axes: Sequence[Axes], values: Iterable[np.ndarray | Sequence[float]]) -> None:
     """A symmetric logarithmic scale where returns lie between 0 and far below.
 
     On the pendulum -100 is a fallen pole, -1 a poor and -0.01 a good controller.
     """
     every = np.concatenate([np.asarray(list(value), dtype=float) for value in values])
-    if every.size and every.max() <= 0 and every.max() > -0.5 and every.min() < -5:
+    if reaches_far_below(every):
         ticks = [0.0] + [-(10.0**k) for k in range(-1, 7) if 10.0**k < -3 * every.min()]
         for axis in axes:
             axis.set_yscale("symlog", linthresh=0.1, linscale=0.5)

@@ -1,0 +1,148 @@
+"""The bound on what cancelling can do: a controller that is told the disturbance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import Transform
+
+from torchrl_l1.control.layout import L1_KEY, required_entry
+
+# Where the executed input waits, inside the tensordict, for the base environment to return.
+_PENDING = "_oracle_pending"
+
+
+class OracleTransform(Transform):
+    r"""A clairvoyant in the place of :class:`~torchrl_l1.control.L1Transform`.
+
+    It looks up the matched disturbances that stand before it in ``Compose`` and sends what they
+    turn back into the policy's action: the policy's action less the matched disturbance, clipped
+    once, at the end, to what the actuators can do. With disturbances
+    :math:`d_1, \dots, d_k` in the order of ``Compose``, an input :math:`u` reaches the plant as
+    :math:`d_1(\dots d_k(u))`, and the oracle sends
+
+    .. math:: u = \mathrm{clip}\big(d_k^{-1}(\dots d_1^{-1}(\pi(x)))\big).
+
+    No estimator can do better than this with the same policy: wherever the bounds allow it, the
+    plant receives exactly what the policy asked for, from the first step on. It knows nothing of
+    noise, of disturbances that the input does not reach, nor of how good the policy is: one that
+    gains from a disturbance loses with the oracle.
+
+    A disturbance is matched for it if its transform has a method ``compensate(action)`` that
+    returns, without a side effect, the action which, sent through the transform at this step,
+    makes the plant receive ``action``.
+
+    ``action`` stays the policy's, and ``("next", key, "u_exec")`` holds the executed input, as
+    with ``L1Transform``, which this takes the place of: it must come after the disturbances, and
+    there must not be both.
+
+    Args:
+        action_key: key of the action.
+        key: name of the nested tensordict with the executed input.
+
+    Raises:
+        KeyError: at a step, if there is no action.
+        RuntimeError: if used in a replay buffer.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_l1.envs import make_env
+        >>> env = make_env("inverted_pendulum", 2, actuator_bias=0.5, seed=0,
+        ...                extra_transforms=[OracleTransform()])
+        >>> data = env.rollout(3)
+        >>> executed = (data["action"] - 0.5).clamp(-3.0, 3.0)
+        >>> torch.equal(data["next", "l1", "u_exec"], executed)
+        True
+    """
+
+    def __init__(self, action_key: NestedKey = "action", key: str = L1_KEY) -> None:
+        super().__init__()
+        self.action_key = unravel_key(action_key)
+        self.key = key
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the executed input."""
+        action = self._action_spec()
+        executed = Unbounded(shape=action.shape, dtype=action.dtype, device=action.device)
+        shape = observation_spec.shape
+        observation_spec[self.key] = Composite(u_exec=executed, shape=shape, device=action.device)
+        return observation_spec
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Refused: the oracle acts at the steps of an environment, not on stored data.
+
+        Raises:
+            RuntimeError: always.
+        """
+        raise RuntimeError(self._refusal())
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        executed = required_entry(tensordict, self.action_key, "OracleTransform")
+        with torch.no_grad():
+            for compensate in self._compensations():
+                executed = compensate(executed)
+            bounds = self._action_spec()
+            if isinstance(bounds, Bounded):
+                executed = executed.clamp(bounds.space.low, bounds.space.high)
+        # The caller's tensordict keeps the policy's action: this one is a shallow copy.
+        tensordict.set(self.action_key, executed)
+        return tensordict.set(_PENDING, executed)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        executed = tensordict.get(_PENDING)
+        stepped = tensordict.get("_step", None)
+        if stepped is not None:
+            before = tensordict.get((self.key, "u_exec"))
+            executed = executed.where(stepped.reshape(*tensordict.batch_size, 1), before)
+        return next_tensordict.set((self.key, "u_exec"), executed)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        # Partial resets are merged by the environment, which discards the rows not reset.
+        action = self._action_spec()
+        extra = tensordict_reset.batch_size[: tensordict_reset.ndim - action.ndim + 1]
+        nothing = torch.zeros(*extra, *action.shape, dtype=action.dtype, device=action.device)
+        return tensordict_reset.set((self.key, "u_exec"), nothing)
+
+    def _action_spec(self) -> TensorSpec:
+        # That of the actuators, whatever transforms make of it on the way to the policy.
+        return self._environment().base_env.full_action_spec[self.action_key]
+
+    def _environment(self) -> EnvBase:
+        try:
+            environment = self.container
+        except ValueError:  # TorchRL's answer where the container is a replay buffer
+            environment = None
+        if environment is None:
+            raise RuntimeError(self._refusal())
+        return environment
+
+    def _refusal(self) -> str:
+        return (
+            "OracleTransform acts inside an environment: append it to a TransformedEnv, not to a "
+            "replay buffer. Stored data already hold the executed input, under "
+            f"{('next', self.key, 'u_exec')}"
+        )
+
+    def _compensations(self) -> Iterator[Callable[[Tensor], Tensor]]:
+        """Those of the disturbances before this one, in the order in which they are undone.
+
+        An action meets the last transform first and the plant last: what the plant is to receive
+        is traced back from the first transform.
+        """
+        for transform in self._environment().transform.modules():
+            if transform is self:
+                return
+            compensate = getattr(transform, "compensate", None)
+            if compensate is not None:
+                yield compensate
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(key={self.key!r})"

@@ -1,0 +1,366 @@
+"""What controllers give back of what an oracle would: columns, tables and heat maps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize, SymLogNorm, TwoSlopeNorm
+
+from torchrl_l1.algorithms.collection import ORACLE
+from torchrl_l1.algorithms.facts import AlgorithmFacts
+from torchrl_l1.envs import DISTURBANCES
+from torchrl_l1.experiment.l1_options import UNTUNED
+from torchrl_l1.experiment.matrix import disturbance_words, disturbed
+from torchrl_l1.report.page import Page, grouped, interval_text, markdown, number, spread_text
+from torchrl_l1.report.statistics import recovered
+from torchrl_l1.report.study import noise_order
+from torchrl_l1.report.style import (
+    arm_label,
+    grid,
+    named,
+    noise_words,
+    reaches_far_below,
+    save,
+    title,
+)
+
+Row = Mapping[str, Any]
+
+FEW_DISTURBANCES = 2
+"""As many that vary have a column each in a table; of more, one column names the disturbance."""
+
+# Pixels that a figure may have to a side are limited, and so is patience.
+_LINE_INCHES, _CELL_INCHES = 0.24, 1.05
+
+
+def recovery_columns(
+    off: Mapping[Hashable, Sequence[float]],
+    on: Mapping[Hashable, Sequence[float]],
+    oracle: Mapping[Hashable, Sequence[float]],
+) -> dict[str, Any]:
+    """Columns of :func:`~torchrl_l1.report.statistics.recovered`; none if nothing can be paired.
+
+    ``gap`` is the oracle's mean return less that without L1, and ``recovered`` the share of it
+    that the controller gives back, each with ``_low`` and ``_high``; there is no ``recovered``
+    where the interval of the gap includes 0. ``recovered_policies`` counts the policies.
+
+    Args:
+        off: returns of the episodes of each policy without L1.
+        on: with the controller.
+        oracle: with the oracle.
+    """
+    shared = [
+        policy
+        for policy, returns in off.items()
+        if len(returns) == len(on.get(policy, ())) == len(oracle.get(policy, ())) > 0
+    ]
+    if not shared:
+        return {}
+    found = recovered(
+        *([np.asarray(one[policy]) for policy in shared] for one in (off, on, oracle))
+    )
+    columns: dict[str, Any] = {
+        "gap": found.gap,
+        "gap_low": found.gap_interval.low,
+        "gap_high": found.gap_interval.high,
+        "recovered_policies": found.policies,
+    }
+    if found.share is not None and found.interval is not None:
+        low, high = found.interval.low, found.interval.high
+        columns |= {"recovered": found.share, "recovered_low": low, "recovered_high": high}
+    return columns
+
+
+def recovered_text(row: Row) -> str:
+    """The share with its interval, or a dash; with a star where the disturbance does good.
+
+    Examples:
+        >>> recovered_text({"recovered": 0.8234, "recovered_low": 0.7, "recovered_high": 0.95})
+        '0.82 [0.70, 0.95]'
+        >>> recovered_text({"recovered": 1.1, "recovered_low": 1, "recovered_high": 2, "gap": -3.0})
+        '1.10* [1.00, 2.00]'
+        >>> recovered_text({"gap": 0.1})
+        '–'
+    """
+    if row.get("recovered") in (None, ""):  # empty in tables read again
+        return "–"
+    low, high = (float(row[f"recovered_{side}"]) for side in ("low", "high"))
+    return f"{float(row['recovered']):.2f}{_star(row)} [{low:.2f}, {high:.2f}]"
+
+
+def _star(row: Row) -> str:
+    """Marks a share of what the disturbance gives, and not of what it takes."""
+    return "*" * (float(row.get("gap") or 0.0) < 0)
+
+
+def is_about_robustness(rows: Sequence[Row]) -> bool:
+    """Whether tests ask an oracle, or go through more disturbances than a few."""
+    return any(row["l1"] == ORACLE for row in rows) or len(varied(rows)) > FEW_DISTURBANCES
+
+
+def varied(rows: Sequence[Row]) -> list[str]:
+    """Names of the disturbances that are not neutral in some row."""
+    found = {name for row in rows for name in disturbed(row)}
+    return [name for name in DISTURBANCES if name in found]
+
+
+def disturbance_cells(row: Row, names: Sequence[str]) -> dict[str, str]:
+    """A row's disturbances as cells of a table; neutral ones are left empty.
+
+    Args:
+        row: of the table.
+        names: those that vary in the table.
+
+    Examples:
+        >>> disturbance_cells({"bias": 0.5, "gain": 1.0}, ["bias", "gain"])
+        {'bias': '0.5', 'gain': ''}
+        >>> disturbance_cells({"bias": 0.5, "gain": 1.0}, ["bias", "gain", "lag"])
+        {'disturbance': 'bias 0.5'}
+    """
+    found = disturbed(row)
+    if len(names) > FEW_DISTURBANCES:
+        return {"disturbance": disturbance_words(row) if found else ""}
+    return {name: f"{found[name]:g}" if name in found else "" for name in names}
+
+
+def by_disturbance(row: Row) -> tuple[Any, ...]:
+    """Sort key: undisturbed first, then disturbance by disturbance and by their values."""
+    found = disturbed(row)
+    order = list(DISTURBANCES)
+    return len(found), [(order.index(name), value) for name, value in found.items()]
+
+
+def controllers(rows: Sequence[Row]) -> list[str]:
+    """The controllers of some tests in their order, the oracle last."""
+    return sorted(dict.fromkeys(row["l1"] for row in rows), key=lambda l1: l1 == ORACLE)
+
+
+def robustness_table(rows: Sequence[Row]) -> str:
+    """A line per disturbance: the return of each controller, and what it recovers.
+
+    Where episodes differ in their length, their mean number of steps stands behind the return.
+
+    Args:
+        rows: of :func:`~torchrl_l1.report.evaluations.evaluation_rows`, of one cell and stage of
+            the training, one kind of policy and one noise.
+    """
+    lengths = {row["steps_mean"] for row in rows if row.get("steps_mean") is not None}
+    tested = controllers(rows)
+    lines = []
+    for _, found in grouped(sorted(rows, key=by_disturbance), tuple(DISTURBANCES), "l1"):
+        first = next(iter(found.values()))
+        line = {"disturbance": disturbance_words(first)}
+        line |= {arm_label(l1): _return_text(found.get(l1), len(lengths) > 1) for l1 in tested}
+        gap = next((row for row in found.values() if "gap" in row), {})
+        line["oracle less off"] = "–"
+        if gap:
+            line["oracle less off"] = f"{number(gap['gap'])} {interval_text(gap, 'gap')}"
+        line |= {
+            f"{arm_label(l1)} recovered": recovered_text(found.get(l1, {}))
+            for l1 in tested
+            if l1 not in UNTUNED
+        }
+        lines.append(line)
+    return markdown(lines)
+
+
+def _return_text(row: Row | None, with_steps: bool) -> str:
+    if row is None:
+        return "–"
+    text = spread_text(row["return_mean"], row["std"] if row["training_seeds"] > 1 else None)
+    steps = row.get("steps_mean")
+    return f"{text}, {steps:.0f} steps" if with_steps and steps is not None else text
+
+
+def training_cells(rows: Sequence[Row]) -> Iterator[tuple[str, tuple[str, ...], list[Row]]]:
+    """The rows of each cell and stage of the training, with a heading and the words of a file."""
+
+    def place(row: Row) -> tuple[str, ...]:
+        keys = ("task", "training_noise", "training_l1", "variant")
+        return (*(row[key] for key in keys), str(row.get("stage", "")))
+
+    for cell in dict.fromkeys(map(place, rows)):
+        task, noise, l1, variant, _ = cell
+        heading = f"{title(task)}: trained with {noise_words(noise)} and {arm_label(l1)}"
+        heading += f" ({variant})" * bool(variant)
+        yield heading, cell, [row for row in rows if place(row) == cell]
+
+
+@dataclass(frozen=True)
+class HeatMap:
+    """What a heat map shows.
+
+    Attributes:
+        column: of the rows.
+        words: under the heading.
+        colors: name of a colour map.
+        text: of a row, in its cell.
+        scale: from all values, finite ones, to that of the colours.
+        without: controllers that it has no column for.
+        colored: whether a row's cell has a colour beside its number.
+    """
+
+    column: str
+    words: str
+    colors: str
+    text: Callable[[Row], str]
+    scale: Callable[[np.ndarray], Normalize]
+    without: tuple[str, ...] = ()
+    colored: Callable[[Row], bool] = lambda row: True
+
+
+def _share_scale(values: np.ndarray) -> Normalize:
+    # Beyond these the number in the cell says it.
+    return TwoSlopeNorm(0.0, -1.0, 1.0)
+
+
+def _return_scale(values: np.ndarray) -> Normalize:
+    low, high = float(values.min()), float(values.max())
+    if reaches_far_below(values, below=-1.0):
+        return SymLogNorm(0.1, vmin=low, vmax=high)
+    return Normalize(low, high)
+
+
+SHARES = HeatMap(
+    "recovered",
+    "recovered: 1 as the oracle, 0 as L1 off; empty: these two do not differ\n"
+    "*: the disturbance does good, which 1 undoes",
+    "RdBu",
+    lambda row: f"{float(row['recovered']):.2f}{_star(row)}",
+    _share_scale,
+    UNTUNED,
+    lambda row: not _star(row),
+)
+"""The shares that controllers recover; none where oracle and L1 off do not differ."""
+
+RETURNS = HeatMap(
+    "return_mean", "mean return", "viridis", lambda row: number(row["return_mean"]), _return_scale
+)
+"""Means over training seeds."""
+
+MEDIANS = HeatMap(
+    "return_median",
+    "median return",
+    "viridis",
+    lambda row: number(row["return_median"]),
+    _return_scale,
+)
+"""Medians over training seeds."""
+
+
+def plot_heat_map(
+    rows: Sequence[Row], shown: HeatMap, heading: str, file: Path, algorithm: AlgorithmFacts
+) -> Path | None:
+    """Controllers across, disturbances down, a number in each cell; grey and empty where none is.
+
+    There is a panel for each stage, kind of policy and noise.
+
+    Args:
+        rows: of one cell of the training.
+        shown: what the cells show.
+        heading: title of the figure.
+        file: where to.
+        algorithm: what the policies are of.
+
+    Returns:
+        the file, or ``None`` if there is no value to show.
+    """
+    mine = [row for row in rows if row["l1"] not in shown.without]
+    known = [row for row in mine if row.get(shown.column) is not None]
+    if not known:
+        return None
+    scale = shown.scale(np.array([float(row[shown.column]) for row in known]))
+    tested = controllers(mine)
+    lines = list(dict.fromkeys(map(disturbance_words, sorted(mine, key=by_disturbance))))
+    places = sorted(dict.fromkeys(map(_place, known)), key=lambda place: noise_order(place[2]))
+    labels = 0.075 * max(map(len, lines))
+    figure, axes = grid(
+        len(places),
+        columns=len(places),
+        width=labels + _CELL_INCHES * len(tested) + 0.3,
+        height=_LINE_INCHES * len(lines) + 1.7,
+    )
+    for axis, (stage, policy, noise) in zip(axes, places, strict=True):
+        cells = {
+            (lines.index(disturbance_words(row)), tested.index(row["l1"])): row
+            for row in known
+            if _place(row) == (stage, policy, noise)
+        }
+        _draw(axis, cells, (len(lines), len(tested)), shown, scale)
+        axis.set_xticks(range(len(tested)), [arm_label(l1).replace(" ", "\n") for l1 in tested])
+        axis.set_yticks(range(len(lines)), lines)
+        axis.set_title(
+            ", ".join(filter(None, (algorithm.acting(policy, stage), _noise(noise)))), fontsize=10
+        )
+    figure.suptitle(f"{heading}\n{shown.words}", fontsize=10)
+    return save(figure, file)
+
+
+def _draw(
+    axis: Axes,
+    cells: Mapping[tuple[int, int], Row],
+    shape: tuple[int, int],
+    shown: HeatMap,
+    scale: Normalize,
+) -> None:
+    values = np.ma.masked_all(shape)
+    for place, row in cells.items():
+        if shown.colored(row):
+            values[place] = float(row[shown.column])
+    image = axis.imshow(values, cmap=shown.colors, norm=scale, aspect="auto")
+    for (line, column), row in cells.items():
+        red, green, blue, _ = image.cmap(float(np.clip(scale(float(row[shown.column])), 0.0, 1.0)))
+        dark = shown.colored(row) and 0.299 * red + 0.587 * green + 0.114 * blue < 0.5
+        axis.text(
+            column, line, shown.text(row), ha="center", va="center", fontsize=8,
+            color="white" if dark else "black",
+        )  # fmt: skip
+    axis.set_facecolor("0.9")
+    axis.xaxis.tick_top()
+    axis.tick_params(length=0, labelsize=8)
+    axis.set_xticks(np.arange(0.5, shape[1] - 1), minor=True)
+    axis.set_yticks(np.arange(0.5, shape[0] - 1), minor=True)
+    axis.grid(which="minor", color="white", linewidth=1.5)
+    axis.tick_params(which="minor", length=0)
+
+
+def _place(row: Row) -> tuple[str, str, str]:
+    return row.get("stage", ""), row["policy"], row["noise"]
+
+
+def _noise(noise: str) -> str:
+    return "" if noise == "none" else f"noise: {noise}"
+
+
+def recovery_section(page: Page, algorithm: AlgorithmFacts, name: str, rows: Sequence[Row]) -> None:
+    """Tables and heat maps: the returns, and what controllers give back of what an oracle would."""
+    if any(row["l1"] == ORACLE for row in rows):
+        page.text(
+            "The oracle sends the policy's action less the matched disturbance, clipped: no "
+            "controller can cancel more. *Recovered* is (L1 − off) / (oracle − off) with the 95 % "
+            "interval of a paired bootstrap over policies and their episodes. It is empty where "
+            "the oracle and L1 off do not differ significantly, as under what no input can cancel. "
+            "A star marks where the disturbance does good: a share of 1 undoes that."
+        )
+    if any(row.get("recovered_policies") == 1 for row in rows):
+        page.text(
+            "Where there is one training seed the interval is over its episodes alone and says "
+            "nothing of other trainings."
+        )
+    for heading, words, chosen in training_cells(rows):
+        stage = words[-1]
+        heading += f", stage {stage}" * bool(stage)
+        for policy, noise in dict.fromkeys((row["policy"], row["noise"]) for row in chosen):
+            mine = [row for row in chosen if (row["policy"], row["noise"]) == (policy, noise)]
+            acting = algorithm.actions(policy, stage)
+            words_of = ", ".join(filter(None, (heading, acting, _noise(noise))))
+            page.text(f"{words_of}:", robustness_table(mine))
+        for shown, what in ((RETURNS, "returns"), (SHARES, "recovered")):
+            file = page.file(what, name, *words)
+            drawn = plot_heat_map(chosen, shown, named(page.name, heading), file, algorithm)
+            page.figure(drawn, f"{heading}: {what}")
