@@ -20,7 +20,7 @@ from torchrl_l1.campaign import read_campaign
 from torchrl_l1.campaign.plan import cells
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import ControlAffineDynamics, EnsembleDynamics
-from torchrl_l1.envs import get_task
+from torchrl_l1.envs import DISTURBANCES, get_task
 from torchrl_l1.experiment.errors import RecipeError
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import (
@@ -256,7 +256,11 @@ FILE = Path(__file__).with_name("recipe_digests.json")
 
 
 # Settings that there were not when the digests were made, with the value that does what was done.
-NEWER = {"fit.precision": "float32", "precision": "float32"}
+NEWER = {"fit.precision": "float32", "precision": "float32"} | {
+    f"perturbation.{entry.setting}": entry.neutral
+    for name, entry in DISTURBANCES.items()
+    if name not in ("bias", "gain")
+}
 
 
 def digest(*settings: DictConfig) -> str:
