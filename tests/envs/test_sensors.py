@@ -134,3 +134,15 @@ def test_refusals():
         TransformedEnv(Counter(), SensorBias([1.0, 2.0, 3.0])).reset()
     with pytest.raises(RuntimeError, match="belongs to an environment"):
         SensorBias(0.1)(TensorDict({"observation": torch.zeros(2, 2)}, batch_size=[2]))
+
+
+def test_environments_that_reset_themselves_are_disturbed_once():
+    # There nothing is merged afterwards: what the others read has been disturbed already.
+    env = TransformedEnv(Counter(), SensorBias(0.5))
+    env.reset()
+    seen = step(env)
+    fresh = torch.where(torch.tensor([[True], [False], [False]]), 0.0, seen)
+    mask = TensorDict({"_reset": torch.tensor([[True], [False], [False]])}, batch_size=[3])
+    state = TensorDict({"observation": fresh}, batch_size=[3])
+    after = env.transform._reset_on_native_autoreset(mask, state)["observation"]
+    assert after[:, 0].tolist() == [0.5, 1.5, 1.5]
