@@ -164,11 +164,14 @@ def test_disturbance_interface(transform):
     env = TransformedEnv(BatchedMujocoEnv("half_cheetah", 2, seed=0), transform(0.5))
     check_env_specs(env)
     assert "0.5" in repr(env.transform)
-    for value in (float("nan"), [0.0, float("inf")], [[1.0]]):
+    for value in (float("nan"), [0.0, float("inf")]):
         with pytest.raises(ValueError, match="finite number, or one for each"):
             transform(value)
     wrong = TransformedEnv(BatchedMujocoEnv("half_cheetah", 2, seed=0), transform([1.0, 2.0]))
     with pytest.raises(ValueError, match="2 values, but the action 'action' has 6"):
+        wrong.rollout(1)
+    wrong = TransformedEnv(BatchedMujocoEnv("half_cheetah", 2, seed=0), transform([[1.0]] * 3))
+    with pytest.raises(ValueError, match="one row for each environment"):
         wrong.rollout(1)
     with pytest.raises(RuntimeError, match="belongs to an environment"):
         transform(0.5)(TensorDict({"action": torch.zeros(2, 6)}, batch_size=[2]))

@@ -256,7 +256,11 @@ FILE = Path(__file__).with_name("recipe_digests.json")
 
 
 # Settings that there were not when the digests were made, with the value that does what was done.
-NEWER = {"fit.precision": "float32", "precision": "float32"}
+NEWER = {"fit.precision": "float32", "precision": "float32"} | {
+    f"perturbation.{entry.setting}": entry.neutral
+    for name, entry in DISTURBANCES.items()
+    if name not in ("bias", "gain")
+}
 
 NEWER_IN_EVALUATIONS = {
     "suite": None,

@@ -5,18 +5,32 @@ Importing this package registers the tasks with Gymnasium, ``torchrl_l1/HalfChee
 
 from __future__ import annotations
 
+from torchrl_l1.envs.actuators import (
+    ActuatorBias,
+    ActuatorDelay,
+    ActuatorGain,
+    DeadZone,
+    FailingMotor,
+    SineBias,
+    StepBias,
+    Stiction,
+    WalkBias,
+)
+from torchrl_l1.envs.disturbances import RandomSigns, Uniform
 from torchrl_l1.envs.factory import make_env
 from torchrl_l1.envs.gymnasium_env import MujocoTaskEnv
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
 from torchrl_l1.envs.perturbations import (
     DISTURBANCES,
+    SUITES,
     ActionNoise,
-    ActuatorBias,
-    ActuatorGain,
     Disturbance,
     ObservationNoise,
     Perturbation,
+    suite,
 )
+from torchrl_l1.envs.plant import disturbed_model, wind_force
+from torchrl_l1.envs.sensors import SensorBias, SensorDelay, SensorDropout
 from torchrl_l1.envs.simulation import BatchedSimulator, StartStates, TaskSimulation
 from torchrl_l1.envs.task import Task
 from torchrl_l1.envs.tasks import TASKS, get_task
@@ -26,21 +40,37 @@ register_tasks()
 
 __all__ = [
     "DISTURBANCES",
+    "SUITES",
     "TASKS",
     "ActionNoise",
     "ActuatorBias",
+    "ActuatorDelay",
     "ActuatorGain",
     "BatchedMujocoEnv",
     "BatchedSimulator",
+    "DeadZone",
     "Disturbance",
+    "FailingMotor",
     "MujocoTaskEnv",
     "ObservationNoise",
     "Perturbation",
+    "RandomSigns",
+    "SensorBias",
+    "SensorDelay",
+    "SensorDropout",
+    "SineBias",
     "StartStates",
+    "StepBias",
+    "Stiction",
     "Task",
     "TaskSimulation",
+    "Uniform",
+    "WalkBias",
+    "disturbed_model",
     "get_task",
     "gymnasium_id",
     "make_env",
     "register_tasks",
+    "suite",
+    "wind_force",
 ]

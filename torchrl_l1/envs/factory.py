@@ -3,17 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torchrl.envs import Compose, Transform, TransformedEnv
 
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
-from torchrl_l1.envs.perturbations import DISTURBANCES, ActionNoise, ObservationNoise
+from torchrl_l1.envs.perturbations import (
+    DISTURBANCES,
+    ActionNoise,
+    Disturbance,
+    ObservationNoise,
+)
 from torchrl_l1.envs.task import Task
 
 
-def _differs(value: float | Sequence[float], neutral: float) -> bool:
-    return bool((torch.as_tensor(value, dtype=torch.float64) != neutral).any())
+def _differs(value: Any, neutral: float) -> bool:
+    return callable(value) or bool((torch.as_tensor(value, dtype=torch.float64) != neutral).any())
+
+
+def _active(given: dict[str, Any]) -> list[tuple[Disturbance, Any]]:
+    """The disturbances that do something, with their values, in the order of the registry."""
+    known = {entry.setting: entry for entry in DISTURBANCES.values()}
+    values: dict[str, Any] = {}
+    for argument, value in given.items():
+        setting = DISTURBANCES[argument].setting if argument in DISTURBANCES else argument
+        if setting not in known:
+            raise TypeError(
+                f"make_env has no argument {argument!r}; its disturbances are {', '.join(known)}"
+            )
+        if setting in values:
+            raise TypeError(f"make_env got {setting!r} twice, by its setting and by its name")
+        values[setting] = value
+    return [
+        (entry, values[setting])
+        for setting, entry in known.items()
+        if setting in values and _differs(values[setting], entry.neutral)
+    ]
 
 
 def make_env(
@@ -27,14 +53,18 @@ def make_env(
     max_steps: int | None = None,
     dtype: torch.dtype = torch.float32,
     threads: int = 1,
-    **disturbances: float | Sequence[float],
+    **disturbances: Any,
 ) -> TransformedEnv:
     r"""Build a benchmark environment with noise, disturbances and further transforms.
 
-    The transforms stand in the order ``[ActuatorGain, ActuatorBias, ActionNoise,
-    ObservationNoise, *extra_transforms]``, neutral ones left out. Actions travel from the last to
-    the first, observations from the first to the last. A controller among ``extra_transforms``
-    therefore sees the noisy observation, and for its output :math:`u` the simulator receives
+    The transforms stand in the order ``[*actuators, ActionNoise, ObservationNoise, *sensors,
+    *extra_transforms]``, neutral ones left out. Actions travel from the last to the first, and
+    actuators stand such that the first of :data:`~torchrl_l1.envs.DISTURBANCES` acts first; so
+    do sensors, as observations travel from the first to the last. Changes of the plant are none
+    of transforms but of the simulation.
+
+    A controller among ``extra_transforms`` therefore sees the noisy observation, and for its
+    output :math:`u` the simulator receives with noise, bias and gain
 
     .. math:: g \, (u + \xi + b), \qquad \xi \sim U(-w, w),
 
@@ -51,18 +81,18 @@ def make_env(
         max_steps: steps after which an episode is truncated; the task's horizon if ``None``.
         dtype: floating dtype of observation, action and reward.
         threads: threads that share the physics.
-        **disturbances: values of the disturbances of :class:`~torchrl_l1.envs.Perturbation`,
-            one number or one for each action entry: ``actuator_bias``, the constant of
-            :class:`~torchrl_l1.envs.ActuatorBias`, and ``actuator_gain``, the factor of
-            :class:`~torchrl_l1.envs.ActuatorGain`.
+        **disturbances: values of the disturbances of :class:`~torchrl_l1.envs.Perturbation`, by
+            their settings or by their names in :data:`~torchrl_l1.envs.DISTURBANCES`. Each is
+            what its transform takes (a number, one for each entry, one row for each environment)
+            or, of the plant, a number or one for each environment; or drawn at resets.
 
     Returns:
         A ``TransformedEnv`` with batch size ``[num_envs]``.
 
     Raises:
         KeyError: if the task is unknown.
-        TypeError: for any other argument.
-        ValueError: if a half-width is negative, or a number is not finite.
+        TypeError: for any other argument, or a disturbance that is given twice.
+        ValueError: if a half-width is negative, or a disturbance cannot have its value.
 
     Examples:
         >>> env = make_env("inverted_pendulum", 4, action_noise=0.1, actuator_bias=0.5, seed=0)
@@ -71,22 +101,24 @@ def make_env(
         >>> env.rollout(10)["next", "reward"].shape
         torch.Size([4, 10, 1])
     """
-    known = {entry.setting: entry for entry in DISTURBANCES.values()}
-    for setting in disturbances:
-        if setting not in known:
-            raise TypeError(
-                f"make_env has no argument {setting!r}; its disturbances are {', '.join(known)}"
-            )
-    transforms: list[Transform] = [
-        entry.transform(disturbances[setting])
-        for setting, entry in reversed(known.items())
-        if setting in disturbances and _differs(disturbances[setting], entry.neutral)
-    ]
+    active = _active(disturbances)
+    placed: dict[str, list[Transform]] = {"action": [], "observation": []}
+    for entry, value in active:
+        if entry.transform is not None:
+            placed[entry.acts_on].append(entry.transform(value))
+    transforms = placed["action"][::-1]
     if action_noise != 0:
         transforms.append(ActionNoise(action_noise))
     if observation_noise != 0:
         transforms.append(ObservationNoise(observation_noise))
+    transforms += placed["observation"]
     base = BatchedMujocoEnv(
-        task, num_envs, seed=seed, max_steps=max_steps, dtype=dtype, threads=threads
+        task,
+        num_envs,
+        seed=seed,
+        max_steps=max_steps,
+        dtype=dtype,
+        threads=threads,
+        plant={entry.name: value for entry, value in active if entry.transform is None},
     )
     return TransformedEnv(base, Compose(*transforms, *extra_transforms))

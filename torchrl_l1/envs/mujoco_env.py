@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import mujoco
 import numpy as np
 import torch
@@ -10,6 +12,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_l1.envs.plant import PlantValue
 from torchrl_l1.envs.simulation import TaskSimulation
 from torchrl_l1.envs.task import Task
 from torchrl_l1.envs.tasks import get_task
@@ -40,10 +43,14 @@ class BatchedMujocoEnv(EnvBase):
         dtype: floating dtype of observation, action and reward.
         threads: threads that share the physics; the results do not depend on it. More than one
             helps only where cores are idle and the physics is the dearest part of a step.
+        plant: changes of the plant by name, those of :func:`~torchrl_l1.envs.disturbed_model` and
+            ``wind`` of :func:`~torchrl_l1.envs.wind_force`; each a number, one for each
+            environment, or drawn at resets, such as by :class:`~torchrl_l1.envs.Uniform`.
 
     Raises:
         KeyError: if the task is unknown.
-        ValueError: if ``num_envs``, ``max_steps`` or ``threads`` is not positive.
+        ValueError: if ``num_envs``, ``max_steps`` or ``threads`` is not positive, or there is no
+            such change of the plant.
 
     Examples:
         >>> env = BatchedMujocoEnv("inverted_pendulum", num_envs=3, seed=0)
@@ -63,6 +70,7 @@ class BatchedMujocoEnv(EnvBase):
         max_steps: int | None = None,
         dtype: torch.dtype = torch.float32,
         threads: int = 1,
+        plant: Mapping[str, PlantValue] | None = None,
     ) -> None:
         task = get_task(task)
         max_steps = task.horizon if max_steps is None else max_steps
@@ -75,7 +83,7 @@ class BatchedMujocoEnv(EnvBase):
         self.num_envs = num_envs
         self.max_steps = max_steps
         self._dtype = dtype
-        self._simulation = TaskSimulation(task, num_envs, threads)
+        self._simulation = TaskSimulation(task, num_envs, threads, plant)
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._make_specs()
         self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
@@ -101,7 +109,7 @@ class BatchedMujocoEnv(EnvBase):
 
     @property
     def model(self) -> mujoco.MjModel:
-        """The compiled MuJoCo model, shared by all environments."""
+        """The compiled MuJoCo model, before changes of the plant; shared by all environments."""
         return self._simulation.simulator.model
 
     def simulator_state(self) -> tuple[np.ndarray, np.ndarray]:

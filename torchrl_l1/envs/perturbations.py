@@ -3,34 +3,32 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform
 
-
-class _EnvironmentOnly(Transform):
-    """A transform of environments, with the reason why stored data must not pass it."""
-
-    reason: ClassVar[str]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Refuse to work on stored data.
-
-        Raises:
-            RuntimeError: always.
-        """
-        raise RuntimeError(
-            f"{type(self).__name__} belongs to an environment (TransformedEnv), not to a replay "
-            f"buffer or a policy: {self.reason}"
-        )
+from torchrl_l1.envs.actuators import (
+    ActuatorBias,
+    ActuatorDelay,
+    ActuatorGain,
+    DeadZone,
+    FailingMotor,
+    SineBias,
+    StepBias,
+    Stiction,
+    WalkBias,
+)
+from torchrl_l1.envs.disturbances import EnvironmentTransform, RandomSigns
+from torchrl_l1.envs.plant import check_plant
+from torchrl_l1.envs.sensors import SensorBias, SensorDelay, SensorDropout
 
 
-class _UniformNoise(_EnvironmentOnly):
+class _UniformNoise(EnvironmentTransform):
     """Uniform noise of a given half-width, drawn from torch's global generator."""
 
     reason = "noise must enter the data once, while they are collected"
@@ -109,88 +107,11 @@ class ObservationNoise(_UniformNoise):
         return next_tensordict.set(self.key, self._noisy(next_tensordict.get(self.key)))
 
 
-class _ActuatorDisturbance(_EnvironmentOnly):
-    """An elementwise map of the action on its way to the base environment."""
-
-    reason = "it changes what an environment executes"
-
-    value: Tensor
-
-    def __init__(
-        self,
-        disturb: Callable[[Tensor, Tensor], Tensor],
-        value: float | Sequence[float],
-        action_key: NestedKey,
-    ) -> None:
-        super().__init__()
-        tensor = torch.as_tensor(value, dtype=torch.float64)
-        if tensor.ndim > 1 or not tensor.isfinite().all():
-            raise ValueError(
-                f"{type(self).__name__} needs a finite number, or one for each action entry, "
-                f"got {value!r}"
-            )
-        self.register_buffer("value", tensor)
-        self.action_key = action_key
-        self._disturb = disturb
-
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = tensordict.get(self.action_key)
-        if self.value.ndim and self.value.shape[-1] != action.shape[-1]:
-            raise ValueError(
-                f"{type(self).__name__} has {self.value.shape[-1]} values, but the action "
-                f"{self.action_key!r} has {action.shape[-1]} entries"
-            )
-        return tensordict.set(self.action_key, self._disturb(action, self.value.to(action)))
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.value.tolist()}, key={self.action_key!r})"
-
-
-class ActuatorBias(_ActuatorDisturbance):
-    """A constant on top of every action that the environment executes: ``u + bias``.
-
-    The textbook matched disturbance: L1 estimates and cancels it. The action in the rollout is
-    unchanged.
-
-    Args:
-        bias: raw action units; one number, or one for each action entry.
-        action_key: key of the action.
-
-    Raises:
-        ValueError: if the bias is not finite or, at the first step, has the wrong length.
-
-    Examples:
-        >>> from torchrl.envs import TransformedEnv
-        >>> from torchrl_l1.envs import BatchedMujocoEnv
-        >>> base = BatchedMujocoEnv("half_cheetah", num_envs=2, seed=0)
-        >>> env = TransformedEnv(base, ActuatorBias([0.2, 0, 0, 0, 0, 0]))
-        >>> env.rollout(3)["action"].shape
-        torch.Size([2, 3, 6])
-    """
-
-    def __init__(self, bias: float | Sequence[float], action_key: NestedKey = "action") -> None:
-        super().__init__(torch.add, bias, action_key)
-
-
-class ActuatorGain(_ActuatorDisturbance):
-    """A factor on every action that the environment executes: ``gain * u``.
-
-    A weakened (or overdriven) actuator. The action in the rollout is unchanged.
-
-    Args:
-        gain: one number, or one for each action entry; 1 is the nominal actuator.
-        action_key: key of the action.
-
-    Raises:
-        ValueError: if the gain is not finite or, at the first step, has the wrong length.
-    """
-
-    def __init__(self, gain: float | Sequence[float], action_key: NestedKey = "action") -> None:
-        super().__init__(torch.mul, gain, action_key)
-
-
 # Key of the metadata of a field.
 _DISTURBANCE = "disturbance"
+
+SUITES = ("quick", "full")
+"""Selections of values of the disturbances, see :func:`suite`."""
 
 
 @dataclass(frozen=True)
@@ -199,39 +120,74 @@ class Disturbance:
 
     Attributes:
         setting: key of ``perturbation`` in recipes, and argument of :func:`make_env`.
-        name: option of ``torchrl-l1 evaluate``, key of a campaign's evaluations, and column of
-            their tables.
-        transform: makes the transform that applies a value of it.
+        name: option of ``torchrl-l1 evaluate``, key of a campaign's evaluations, column of
+            their tables, and argument of :func:`make_env` as well.
+        transform: makes the transform that applies a value of it; ``None`` if it acts on the
+            plant, see :func:`disturbed_model`.
         neutral: the value that changes nothing.
         units: of its values, in words.
         help: what its values are, in words.
+        matched: whether an input within the bounds of the actuators could cancel it.
+        acts_on: where it enters: ``"action"``, ``"observation"`` or ``"plant"``.
+        levels: by suite, the values that it is tested with.
     """
 
     setting: str
     name: str
-    transform: Callable[[float | Sequence[float]], Transform]
+    transform: Callable[[Any], Transform] | None
     neutral: float
     units: str
     help: str
+    matched: bool = False
+    acts_on: Literal["action", "observation", "plant"] = "action"
+    levels: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     @property
     def words(self) -> str:
         """Its name in sentences and at axes, such as ``actuator bias``."""
         return self.setting.replace("_", " ")
 
+    def check(self, value: float) -> None:
+        """Refuse a value that it cannot have.
+
+        Raises:
+            ValueError: naming the value.
+        """
+        if self.transform is None:
+            check_plant(self.name, value)
+        elif value != self.neutral:
+            self.transform(value)
+
 
 def disturbance(
     name: str,
-    transform: Callable[[float | Sequence[float]], Transform],
+    transform: Callable[[Any], Transform] | None,
     *,
     neutral: float,
     units: str,
     help: str,
+    matched: bool = False,
+    acts_on: Literal["action", "observation", "plant"] = "action",
+    quick: tuple[float, ...] = (),
+    full: tuple[float, ...] = (),
 ) -> Any:
     """A field of :class:`Perturbation` that is a :class:`Disturbance`, neutral by default."""
-    described = {"name": name, "transform": transform, "neutral": neutral}
-    described |= {"units": units, "help": help}
+    described: dict[str, Any] = {"name": name, "transform": transform, "neutral": neutral}
+    described |= {"units": units, "help": help, "matched": matched, "acts_on": acts_on}
+    described["levels"] = {"quick": quick, "full": full}
     return field(default=neutral, metadata={_DISTURBANCE: described})
+
+
+def _sensor(name: str, transform: Callable[[Any], Transform], **described: Any) -> Any:
+    return disturbance(name, transform, acts_on="observation", neutral=0.0, **described)
+
+
+def _plant(name: str, **described: Any) -> Any:
+    return disturbance(name, None, acts_on="plant", **described)
+
+
+def _signs(magnitude: float) -> ActuatorBias:
+    return ActuatorBias(RandomSigns(magnitude))
 
 
 def disturbances_of(settings: type[Perturbation]) -> dict[str, Disturbance]:
@@ -250,24 +206,123 @@ class Perturbation:
 
     A further disturbance is a :class:`~torchrl.envs.Transform` and a field here: options, keys,
     columns, tables and figures follow from the field. Of several the first acts first on the
-    action that a controller sends.
+    action that a controller sends, or on the observation that the environment makes.
 
     Attributes:
         action_noise: half-width of uniform noise on the executed action, action units.
         observation_noise: half-width of uniform noise on the observation, raw state units.
         actuator_bias: constant added to the executed action, action units.
         actuator_gain: factor on the executed action.
+        random_signs_bias: magnitude of a constant bias whose signs are drawn for every episode
+            and action entry, action units.
+        sine_bias: amplitude of a bias with a period of 50 steps, action units.
+        step_bias: bias that sets in at the 50th step of an episode, action units.
+        random_walk_bias: standard deviation of what a bias changes in a step, action units.
+        motor_gain: factor on the first entry of the action only.
+        dead_zone: width up to which the action does nothing, action units.
+        stiction: band within which an actuator holds its output, action units.
+        actuator_delay: steps by which the action comes late.
+        sensor_bias: constant added to the observation, raw state units.
+        sensor_delay: steps by which the observation comes late.
+        sensor_dropout: probability that an entry of the observation repeats what was read last.
+        payload: extra mass of the first body that moves, as a fraction of the model's mass.
+        body_mass: factor on mass and inertia of all bodies.
+        contact_friction: factor on the friction of all contacts.
+        joint_damping: factor on the damping of all joints.
+        joint_armature: factor on the inertia of the rotors of all joints.
+        ground_slope: degrees by which gravity is tilted; uphill is along x.
+        wind_force: force along x on the first body that moves, as a fraction of the weight.
+        contact_softness: factor on the time constant of all contacts.
     """
 
     action_noise: float = 0.0
     observation_noise: float = 0.0
     actuator_bias: float = disturbance(
-        "bias", ActuatorBias, neutral=0.0, units="action units",
-        help="actuator biases, action units",
+        "bias", ActuatorBias, neutral=0.0, units="action units", matched=True,
+        help="actuator biases, action units", quick=(0.3,), full=(-0.5, -0.2, 0.2, 0.5),
     )  # fmt: skip
     actuator_gain: float = disturbance(
-        "gain", ActuatorGain, neutral=1.0, units="factor", help="actuator gains"
-    )
+        "gain", ActuatorGain, neutral=1.0, units="factor", matched=True,
+        help="actuator gains", quick=(0.6,), full=(0.4, 0.6, 0.8, 1.2),
+    )  # fmt: skip
+    random_signs_bias: float = disturbance(
+        "signs", _signs, neutral=0.0, units="action units", matched=True,
+        help="magnitudes of biases of random signs, action units",
+        quick=(0.3,), full=(0.1, 0.3, 0.5),
+    )  # fmt: skip
+    sine_bias: float = disturbance(
+        "sine", SineBias, neutral=0.0, units="action units", matched=True,
+        help="amplitudes of a bias that swings, action units", quick=(0.3,), full=(0.1, 0.3, 0.5),
+    )  # fmt: skip
+    step_bias: float = disturbance(
+        "step", StepBias, neutral=0.0, units="action units", matched=True,
+        help="biases that set in at step 50, action units", quick=(0.3,), full=(0.1, 0.3, 0.5),
+    )  # fmt: skip
+    random_walk_bias: float = disturbance(
+        "walk", WalkBias, neutral=0.0, units="action units", matched=True,
+        help="deviations of a step of a bias that walks at random, action units",
+        quick=(0.03,), full=(0.01, 0.03, 0.05),
+    )  # fmt: skip
+    motor_gain: float = disturbance(
+        "motor", FailingMotor, neutral=1.0, units="factor",
+        help="gains of the first motor", quick=(0.0,), full=(0.0, 0.25, 0.5),
+    )  # fmt: skip
+    dead_zone: float = disturbance(
+        "deadzone", DeadZone, neutral=0.0, units="action units", matched=True,
+        help="widths of a dead zone, action units", quick=(0.2,), full=(0.1, 0.2, 0.4),
+    )  # fmt: skip
+    stiction: float = disturbance(
+        "stiction", Stiction, neutral=0.0, units="action units",
+        help="bands of stiction, action units", quick=(0.2,), full=(0.1, 0.2, 0.4),
+    )  # fmt: skip
+    actuator_delay: float = disturbance(
+        "delay", ActuatorDelay, neutral=0.0, units="steps",
+        help="delays of the action, steps", quick=(1.0,), full=(1.0, 2.0, 3.0),
+    )  # fmt: skip
+    sensor_bias: float = _sensor(
+        "sensor_bias", SensorBias, units="state units",
+        help="biases of all sensors, state units", quick=(0.05,), full=(0.02, 0.05, 0.1),
+    )  # fmt: skip
+    sensor_delay: float = _sensor(
+        "sensor_delay", SensorDelay, units="steps",
+        help="delays of the observation, steps", quick=(1.0,), full=(1.0, 2.0, 3.0),
+    )  # fmt: skip
+    sensor_dropout: float = _sensor(
+        "dropout", SensorDropout, units="probability",
+        help="probabilities that a reading is lost", quick=(0.2,), full=(0.1, 0.2, 0.4),
+    )  # fmt: skip
+    payload: float = _plant(
+        "payload", neutral=0.0, units="fraction of the mass",
+        help="payloads, fractions of the mass", quick=(0.3,), full=(0.1, 0.3, 0.5),
+    )  # fmt: skip
+    body_mass: float = _plant(
+        "mass", neutral=1.0, units="factor",
+        help="factors on all masses", quick=(1.5,), full=(0.5, 0.75, 1.5, 2.0),
+    )  # fmt: skip
+    contact_friction: float = _plant(
+        "friction", neutral=1.0, units="factor",
+        help="factors on the friction of contacts", quick=(0.5,), full=(0.25, 0.5, 2.0),
+    )  # fmt: skip
+    joint_damping: float = _plant(
+        "damping", neutral=1.0, units="factor",
+        help="factors on the damping of joints", quick=(2.0,), full=(0.5, 2.0, 4.0),
+    )  # fmt: skip
+    joint_armature: float = _plant(
+        "armature", neutral=1.0, units="factor",
+        help="factors on the inertia of rotors", quick=(2.0,), full=(0.5, 2.0, 4.0),
+    )  # fmt: skip
+    ground_slope: float = _plant(
+        "slope", neutral=0.0, units="degrees",
+        help="slopes of the ground, degrees", quick=(5.0,), full=(-10.0, -5.0, 5.0, 10.0),
+    )  # fmt: skip
+    wind_force: float = _plant(
+        "wind", neutral=0.0, units="fraction of the weight",
+        help="forces of wind, fractions of the weight", quick=(-0.1,), full=(-0.2, -0.1, 0.1, 0.2),
+    )  # fmt: skip
+    contact_softness: float = _plant(
+        "softness", neutral=1.0, units="factor",
+        help="factors on the time constant of contacts", quick=(2.0,), full=(2.0, 4.0),
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -275,7 +330,40 @@ class Perturbation:
                 raise ValueError(f"perturbation.{name} must be finite, got {value}")
             if name.endswith("_noise") and value < 0:
                 raise ValueError(f"perturbation.{name} must not be negative, got {value}")
+        for entry in disturbances_of(type(self)).values():
+            try:
+                entry.check(getattr(self, entry.setting))
+            except ValueError as error:
+                raise ValueError(f"perturbation.{entry.setting}: {error}") from None
 
 
 DISTURBANCES: Mapping[str, Disturbance] = disturbances_of(Perturbation)
 """By name: what evaluations vary, and training too where a recipe says so."""
+
+
+def suite(name: str) -> list[dict[str, float]]:
+    """The cells of a suite of disturbances: none first, then each value of each by itself.
+
+    Args:
+        name: one of :data:`SUITES`.
+
+    Returns:
+        What :func:`make_env` takes beside the task: ``{disturbance: value}``.
+
+    Raises:
+        ValueError: for any other name.
+
+    Examples:
+        >>> suite("quick")[:3]
+        [{}, {'bias': 0.3}, {'gain': 0.6}]
+    """
+    if name not in SUITES:
+        raise ValueError(f"unknown suite {name!r}; there are {', '.join(SUITES)}")
+    return [
+        {},
+        *(
+            {entry.name: value}
+            for entry in DISTURBANCES.values()
+            for value in entry.levels.get(name, ())
+        ),
+    ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -11,6 +11,7 @@ import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
+from torchrl_l1.envs.plant import Plant, PlantValue
 from torchrl_l1.envs.task import Task
 from torchrl_l1.envs.tasks import get_task
 
@@ -34,19 +35,28 @@ class BatchedSimulator:
         task: the task to simulate.
         num_envs: number of environments ``N``.
         threads: threads that share the environments; results do not depend on it.
+        plant: changes of the plant, see :class:`~torchrl_l1.envs.plant.Plant`.
 
     Attributes:
-        model: the compiled MuJoCo model.
+        model: the compiled MuJoCo model, without changes of the plant.
+        plant: the changes, if there are any.
         batch: MuJoCo's own interface to all simulations (contacts, sensors, body poses, ...).
         qpos: positions ``(N, nq)``, float64; a live view.
         qvel: velocities ``(N, nv)``, float64; a live view.
     """
 
-    def __init__(self, task: Task, num_envs: int, threads: int = 1) -> None:
+    def __init__(
+        self,
+        task: Task,
+        num_envs: int,
+        threads: int = 1,
+        plant: Mapping[str, PlantValue] | None = None,
+    ) -> None:
         self.task = task
         self.num_envs = num_envs
         self.threads = min(threads, num_envs)
         self.model: mujoco.MjModel = task.build_model()
+        self.plant = Plant(self.model, num_envs, plant) if plant else None
         self._start()
 
     def _start(self) -> None:
@@ -54,9 +64,11 @@ class BatchedSimulator:
         self.qpos: np.ndarray = self.batch.bind("qpos")
         self.qvel: np.ndarray = self.batch.bind("qvel")
         self._ctrl: np.ndarray = self.batch.bind("ctrl")
+        if self.plant is not None:
+            self.batch.set_models(self.plant.models())
 
     def __getstate__(self) -> dict[str, Any]:
-        kept = ("task", "num_envs", "threads", "model")
+        kept = ("task", "num_envs", "threads", "model", "plant")
         return {**{k: self.__dict__[k] for k in kept}, "rows": self.batch.state.copy()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -87,10 +99,23 @@ class BatchedSimulator:
                 )
             if not np.isfinite(value).all():
                 raise ValueError(f"{name} has entries that are not finite")
+        self._renew_plant(chosen)
         self.batch.reset(chosen, stage=_NO_STAGE)
+        self._blow(chosen)
         self.qpos[chosen] = qpos
         self.qvel[chosen] = qvel
         self.batch.forward(chosen)
+
+    def _renew_plant(self, chosen: np.ndarray) -> None:
+        if self.plant is not None and self.plant.is_drawn:
+            self.plant.redraw(chosen)
+            self.batch.set_models(self.plant.models())
+
+    def _blow(self, chosen: np.ndarray) -> None:
+        # Forces are part of the state, which a reset clears.
+        forces = None if self.plant is None else self.plant.forces()
+        if forces is not None:
+            self.batch.bind("xfrc_applied")[chosen] = forces[chosen]
 
     def step(self, control: np.ndarray) -> np.ndarray:
         """Advance every environment by one environment step.
@@ -165,6 +190,7 @@ class TaskSimulation:
         task: the task.
         num_envs: number of environments ``N``.
         threads: threads that share the physics.
+        plant: changes of the plant, see :class:`~torchrl_l1.envs.plant.Plant`.
 
     Attributes:
         simulator: the physics.
@@ -172,9 +198,15 @@ class TaskSimulation:
             here; the old one is never written to.
     """
 
-    def __init__(self, task: Task, num_envs: int, threads: int = 1) -> None:
+    def __init__(
+        self,
+        task: Task,
+        num_envs: int,
+        threads: int = 1,
+        plant: Mapping[str, PlantValue] | None = None,
+    ) -> None:
         self.task = task
-        self.simulator = BatchedSimulator(task, num_envs, threads)
+        self.simulator = BatchedSimulator(task, num_envs, threads, plant)
         data = mujoco.MjData(self.simulator.model)
         self._initial = (data.qpos.copy(), data.qvel.copy())
         self.observation = self._observe(self.simulator.qpos)

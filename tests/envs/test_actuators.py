@@ -1,0 +1,253 @@
+"""Disturbances of the action: what is executed, its inverse, and state through resets."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, GymEnv, Transform, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_l1.envs import (
+    ActuatorBias,
+    ActuatorDelay,
+    ActuatorGain,
+    DeadZone,
+    FailingMotor,
+    RandomSigns,
+    SineBias,
+    StepBias,
+    Stiction,
+    Uniform,
+    WalkBias,
+)
+
+
+class Echo(EnvBase):
+    """Its observation is the action that it received; rows end when they are told to."""
+
+    def __init__(self, batch: tuple[int, ...] = (3,), entries: int = 2) -> None:
+        super().__init__(batch_size=batch)
+        self.observation_spec = Composite(
+            observation=Unbounded((*batch, entries), dtype=torch.float64), shape=batch
+        )
+        self.action_spec = Bounded(-1, 1, (*batch, entries), dtype=torch.float64)
+        self.reward_spec = Unbounded((*batch, 1), dtype=torch.float64)
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+    def _reset(self, tensordict: TensorDict | None = None, **kwargs: object) -> TensorDict:
+        return self.full_observation_spec.zero().update(self.full_done_spec.zero())
+
+    def _step(self, tensordict: TensorDict) -> TensorDict:
+        out = self.full_done_spec.zero().set("observation", tensordict["action"].clone())
+        return out.update(self.full_reward_spec.zero())
+
+
+def send(env: EnvBase, action: Tensor) -> Tensor:
+    """What the environment received."""
+    state = TensorDict({"action": action}, batch_size=env.batch_size)
+    return env.step(state)["next", "observation"]
+
+
+def restart(env: EnvBase, rows: list[bool]) -> None:
+    mask = torch.tensor(rows).unsqueeze(-1)
+    env.reset(TensorDict({"_reset": mask}, batch_size=env.batch_size))
+
+
+MATCHED = [
+    lambda v: ActuatorBias(v),
+    lambda v: ActuatorBias([v, -v]),
+    lambda v: ActuatorBias(torch.full((3, 1), v)),
+    lambda v: ActuatorBias(RandomSigns(v)),
+    lambda v: SineBias(v, period=7),
+    lambda v: StepBias(v, at=2),
+    lambda v: WalkBias(v),
+    lambda v: ActuatorGain(1 + v),
+    lambda v: ActuatorGain(Uniform(0.5, 0.5 + v)),
+    lambda v: DeadZone(v),
+]
+
+
+@pytest.mark.parametrize("make", MATCHED)
+@given(value=st.floats(0, 3), seed=st.integers(0, 100))
+@settings(max_examples=8, deadline=None)
+def test_compensation_is_the_inverse_and_changes_nothing(make, value, seed):
+    torch.manual_seed(seed)
+    env = TransformedEnv(Echo(), transform := make(value))
+    assert transform.matched
+    env.reset()
+    for step in range(6):
+        wanted = 2 * torch.rand(3, 2, dtype=torch.float64) - 1
+        generator = torch.get_rng_state()
+        sent = transform.compensate(wanted)
+        assert torch.equal(sent, transform.compensate(wanted))
+        assert torch.equal(torch.get_rng_state(), generator)
+        torch.testing.assert_close(send(env, sent), wanted)
+        if step == 3:
+            restart(env, [True, False, True])
+
+
+def test_bias_of_random_signs_is_drawn_anew_where_an_episode_starts():
+    torch.manual_seed(0)
+    env = TransformedEnv(Echo((3,), 20), ActuatorBias(RandomSigns(0.3)))
+    env.reset()
+    zero = torch.zeros(3, 20, dtype=torch.float64)
+    first = send(env, zero)
+    torch.testing.assert_close(first.abs(), torch.full_like(first, 0.3), rtol=1e-6, atol=0)
+    assert 10 < (first > 0).sum() < 50
+    assert torch.equal(send(env, zero), first)
+    restart(env, [False, True, False])
+    second = send(env, zero)
+    assert torch.equal(second[[0, 2]], first[[0, 2]])
+    assert not torch.equal(second[1], first[1])
+
+
+@pytest.mark.parametrize(
+    ("transform", "expected"),
+    [
+        (SineBias(0.5, period=8), lambda t: 0.5 * math.sin(2 * math.pi * t / 8)),
+        (StepBias(0.5, at=3), lambda t: 0.5 if t >= 3 else 0.0),
+    ],
+)
+def test_biases_in_time_count_from_each_reset(transform, expected):
+    env = TransformedEnv(Echo(), transform)
+    env.reset()
+    zero = torch.zeros(3, 2, dtype=torch.float64)
+    since = [0, 0, 0]
+    for step in range(12):
+        received = send(env, zero)
+        torch.testing.assert_close(
+            received[:, 0], torch.tensor([expected(t) for t in since]).double()
+        )
+        since = [t + 1 for t in since]
+        if step == 4:
+            restart(env, [True, False, False])
+            since[0] = 0
+
+
+def test_walk_spreads_with_the_square_root_of_time_and_starts_at_zero():
+    torch.manual_seed(0)
+    env = TransformedEnv(Echo((2000,), 2), WalkBias(0.1))
+    env.reset()
+    zero = torch.zeros(2000, 2, dtype=torch.float64)
+    assert (send(env, zero) == 0).all()
+    for _ in range(8):
+        send(env, zero)
+    assert send(env, zero).std().item() == pytest.approx(0.3, rel=0.05)
+    restart(env, [True] + [False] * 1999)
+    after = send(env, zero)
+    assert (after[0] == 0).all() and (after[1:] != 0).all()
+
+
+def test_only_one_motor_fails():
+    action = torch.ones(3, 4, dtype=torch.float64)
+    env = TransformedEnv(Echo((3,), 4), FailingMotor(0.25, motor=2))
+    env.reset()
+    assert send(env, action).tolist() == [[1, 1, 0.25, 1]] * 3
+    torch.manual_seed(0)
+    env = TransformedEnv(Echo((50,), 4), FailingMotor(0.0, motor=None))
+    env.reset()
+    received = send(env, torch.ones(50, 4, dtype=torch.float64))
+    assert (received.sum(-1) == 3).all() and (received == 0).any(0).all()
+    with pytest.raises(ValueError, match="no motor 4 among 4"):
+        TransformedEnv(Echo((3,), 4), FailingMotor(0.0, motor=4)).reset()
+
+
+def test_dead_zone_and_stiction_by_hand():
+    env = TransformedEnv(Echo((1,), 4), DeadZone(0.25))
+    env.reset()
+    received = send(env, torch.tensor([[0.25, -0.2, 0.75, -1.0]]).double())
+    assert received.tolist() == [[0, 0, 0.5, -0.75]]
+    env = TransformedEnv(Echo((2,), 1), Stiction(0.25))
+    env.reset()
+    sent = [0.125, 0.5, 0.375, 0.75, 0.8125, 0.375]
+    outputs = [send(env, torch.full((2, 1), one).double()) for one in sent]
+    assert [one[0].item() for one in outputs] == [0, 0.5, 0.5, 0.5, 0.8125, 0.375]
+    restart(env, [True, False])
+    assert send(env, torch.full((2, 1), 0.25).double()).tolist() == [[0.0], [0.375]]
+
+
+def test_delay_of_each_environment_restarts_with_it():
+    env = TransformedEnv(Echo((3,), 1), ActuatorDelay(torch.tensor([[0.0], [1.0], [2.0]])))
+    env.reset()
+    received = [send(env, torch.full((3, 1), float(k)).double())[:, 0].tolist() for k in (1, 2, 3)]
+    assert received == [[1, 0, 0], [2, 1, 0], [3, 2, 1]]
+    restart(env, [False, False, True])
+    received = [send(env, torch.full((3, 1), float(k)).double())[:, 0].tolist() for k in (4, 5, 6)]
+    assert received == [[4, 3, 0], [5, 4, 0], [6, 5, 4]]
+
+
+def test_drawn_delays_keep_the_memory_of_the_others():
+    delays = iter([torch.tensor([[1.0], [3.0]]), torch.tensor([[4.0], [0.0]])])
+    env = TransformedEnv(Echo((2,), 1), ActuatorDelay(lambda shape: next(delays)))
+    env.reset()
+    for k in (1, 2, 3):
+        send(env, torch.full((2, 1), float(k)).double())
+    restart(env, [True, False])
+    received = [
+        send(env, torch.full((2, 1), float(k)).double())[:, 0].tolist() for k in range(4, 9)
+    ]
+    assert received == [[0, 1], [0, 2], [0, 3], [0, 4], [4, 5]]
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        ActuatorBias(RandomSigns(0.3)),
+        SineBias(0.1),
+        StepBias(0.1, at=1),
+        WalkBias(0.1),
+        ActuatorGain(0.5),
+        FailingMotor(0.5, motor=None),
+        DeadZone(0.1),
+        Stiction(0.1),
+        ActuatorDelay(2),
+    ],
+)
+def test_on_gymnasium_batched_and_not(transform: Transform):
+    single = TransformedEnv(GymEnv("InvertedPendulum-v5"), copy.deepcopy(transform))
+    check_env_specs(single)
+    assert single.rollout(20, break_when_any_done=False).shape == (20,)
+    vectorized = GymEnv("InvertedPendulum-v5", num_envs=2)
+    many = TransformedEnv(vectorized, copy.deepcopy(transform), auto_unwrap=True)
+    rollout = many.rollout(40, break_when_any_done=False)
+    assert rollout.shape == (2, 40) and rollout["next", "done"].any()
+    many.close()
+    again = pickle.loads(pickle.dumps(transform))
+    assert repr(again) == repr(transform)
+
+
+def test_copies_have_a_state_of_their_own():
+    env = TransformedEnv(Echo(), WalkBias(0.1))
+    env.reset()
+    zero = torch.zeros(3, 2, dtype=torch.float64)
+    twin = copy.deepcopy(env)
+    send(twin, zero)
+    assert (send(env, zero) == 0).all() and (send(twin, zero) != 0).all()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: SineBias(0.1, period=0), "period must be positive"),
+        (lambda: StepBias(0.1, at=-1), "at must not be negative"),
+        (lambda: WalkBias(-0.1), "deviation must not be negative"),
+        (lambda: DeadZone(-0.1), "width must not be negative"),
+        (lambda: Stiction(-0.1), "band must not be negative"),
+        (lambda: ActuatorDelay(0.5), "steps must be whole"),
+        (lambda: ActuatorDelay(float("inf")), "finite number"),
+    ],
+)
+def test_values_that_cannot_be(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

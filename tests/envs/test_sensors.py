@@ -1,0 +1,148 @@
+"""Disturbances of the observation: what is seen, and state through resets."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, GymEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_l1.envs import RandomSigns, SensorBias, SensorDelay, SensorDropout
+
+
+class Counter(EnvBase):
+    """Its observation counts the steps of each environment from 1, 0 at a reset."""
+
+    def __init__(self, batch: tuple[int, ...] = (3,), entries: int = 2) -> None:
+        super().__init__(batch_size=batch)
+        self.observation_spec = Composite(
+            observation=Unbounded((*batch, entries), dtype=torch.float64), shape=batch
+        )
+        self.action_spec = Bounded(-1, 1, (*batch, 1))
+        self.reward_spec = Unbounded((*batch, 1))
+        self.count = torch.zeros(*batch, entries, dtype=torch.float64)
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+    def _reset(self, tensordict: TensorDict | None = None, **kwargs: object) -> TensorDict:
+        reset = None if tensordict is None else tensordict.get("_reset", None)
+        kept = 0 if reset is None else (~reset).double()
+        self.count = self.count * kept
+        done = self.full_done_spec.zero()
+        return done.set("observation", self.count.clone())
+
+    def _step(self, tensordict: TensorDict) -> TensorDict:
+        self.count = self.count + 1
+        out = self.full_done_spec.zero().set("observation", self.count.clone())
+        return out.update(self.full_reward_spec.zero())
+
+
+def step(env: EnvBase) -> Tensor:
+    return env.step(env.full_action_spec.zero())["next", "observation"]
+
+
+def restart(env: EnvBase, current: Tensor, rows: list[bool]) -> Tensor:
+    mask = torch.tensor(rows).unsqueeze(-1)
+    state = TensorDict({"_reset": mask, "observation": current}, batch_size=env.batch_size)
+    return env.reset(state)["observation"]
+
+
+def test_bias_is_there_at_resets_too_and_once():
+    env = TransformedEnv(Counter(), SensorBias([0.5, -1.0]))
+    assert env.reset()["observation"].tolist() == [[0.5, -1.0]] * 3
+    seen = step(env)
+    assert seen.tolist() == [[1.5, 0.0]] * 3
+    after = restart(env, seen, [True, False, False])
+    assert after.tolist() == [[0.5, -1.0], [1.5, 0.0], [1.5, 0.0]]
+    assert step(env)[:, 0].tolist() == [1.5, 2.5, 2.5]
+
+
+def test_drawn_bias_changes_only_where_an_episode_starts():
+    torch.manual_seed(0)
+    env = TransformedEnv(Counter((2,), 30), SensorBias(RandomSigns(0.25)))
+    first = env.reset()["observation"]
+    assert (first.abs() == 0.25).all()
+    seen = step(env)
+    torch.testing.assert_close(seen, first + 1)
+    after = restart(env, seen, [False, True])
+    assert torch.equal(after[0], seen[0]) and not torch.equal(after[1], first[1])
+    torch.testing.assert_close(step(env)[1], after[1] + 1)
+
+
+def test_delay_repeats_the_first_reading_until_there_is_an_older_one():
+    env = TransformedEnv(Counter(), SensorDelay(torch.tensor([[0.0], [1.0], [2.0]])))
+    env.reset()
+    seen = [step(env) for _ in range(4)]
+    assert [one[:, 0].tolist() for one in seen] == [[1, 0, 0], [2, 1, 0], [3, 2, 1], [4, 3, 2]]
+    after = restart(env, seen[-1], [False, False, True])
+    assert after[:, 0].tolist() == [4, 3, 0]
+    assert [step(env)[:, 0].tolist() for _ in range(3)] == [[5, 4, 0], [6, 5, 0], [7, 6, 1]]
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_dropout_holds_what_was_read_last(whole):
+    torch.manual_seed(0)
+    env = TransformedEnv(Counter((2000,), 2), SensorDropout(0.3, whole=whole))
+    last = env.reset()["observation"]
+    for count in range(1, 5):
+        seen = step(env)
+        lost = seen != count
+        assert torch.equal(seen, torch.where(lost, last, torch.full_like(seen, count)))
+        assert lost.double().mean().item() == pytest.approx(0.3, abs=0.04)
+        assert torch.equal(lost[:, 0], lost[:, 1]) == whole
+        last = seen
+    after = restart(env, last, [True] + [False] * 1999)
+    assert (after[0] == 0).all() and torch.equal(after[1:], last[1:])
+    seen = step(env)
+    assert set(seen[0].tolist()) <= {0.0, 1.0}
+
+
+def test_sure_loss_shows_the_reset_for_ever():
+    env = TransformedEnv(Counter(), SensorDropout(1.0))
+    rollout = env.rollout(5)
+    assert (rollout["next", "observation"] == 0).all()
+
+
+@pytest.mark.parametrize("transform", [SensorBias(0.1), SensorDelay(2), SensorDropout(0.5)])
+def test_on_gymnasium_batched_and_not(transform):
+    assert not transform.matched
+    single = TransformedEnv(GymEnv("InvertedPendulum-v5"), copy.deepcopy(transform))
+    check_env_specs(single)
+    assert single.rollout(20, break_when_any_done=False).shape == (20,)
+    vectorized = GymEnv("InvertedPendulum-v5", num_envs=2)
+    many = TransformedEnv(vectorized, copy.deepcopy(transform), auto_unwrap=True)
+    rollout = many.rollout(40, break_when_any_done=False)
+    assert rollout["next", "done"].any()
+    inner = ~rollout["next", "done"][:, :-1].squeeze(-1)
+    carried, seen = rollout["observation"][:, 1:], rollout["next", "observation"][:, :-1]
+    assert torch.equal(carried[inner], seen[inner])
+    many.close()
+
+
+def test_refusals():
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        SensorDropout(1.5)
+    with pytest.raises(ValueError, match="whole"):
+        SensorDelay(-1)
+    with pytest.raises(ValueError, match="3 values, but the observation 'observation' has 2"):
+        TransformedEnv(Counter(), SensorBias([1.0, 2.0, 3.0])).reset()
+    with pytest.raises(RuntimeError, match="belongs to an environment"):
+        SensorBias(0.1)(TensorDict({"observation": torch.zeros(2, 2)}, batch_size=[2]))
+
+
+def test_environments_that_reset_themselves_are_disturbed_once():
+    # There nothing is merged afterwards: what the others read has been disturbed already.
+    env = TransformedEnv(Counter(), SensorBias(0.5))
+    env.reset()
+    seen = step(env)
+    fresh = torch.where(torch.tensor([[True], [False], [False]]), 0.0, seen)
+    mask = TensorDict({"_reset": torch.tensor([[True], [False], [False]])}, batch_size=[3])
+    state = TensorDict({"observation": fresh}, batch_size=[3])
+    after = env.transform._reset_on_native_autoreset(mask, state)["observation"]
+    assert after[:, 0].tolist() == [0.5, 1.5, 1.5]

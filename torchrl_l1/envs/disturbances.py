@@ -1,0 +1,200 @@
+"""What the disturbances of actuators and of sensors share: values, state, and delay lines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.envs import Transform
+
+Draw = Callable[[torch.Size], Tensor]
+"""Makes values of a shape: for each environment, drawn again whenever that environment resets."""
+
+Value = float | Sequence[float] | Tensor | Draw
+"""A number, one for each entry, one for each environment ``(*batch, 1 or entries)``, or drawn."""
+
+
+@dataclass(frozen=True)
+class RandomSigns:
+    """A magnitude with a sign of its own for each environment and entry, drawn at every reset.
+
+    Examples:
+        >>> RandomSigns(0.3)(torch.Size([4, 6])).abs().unique()
+        tensor([0.3000])
+    """
+
+    magnitude: float
+
+    def __call__(self, shape: torch.Size) -> Tensor:
+        """Draw from torch's global generator."""
+        return self.magnitude * (1 - 2 * torch.randint(2, shape).float())
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """Uniform in ``[low, high)``, drawn for each environment at every reset.
+
+    Attributes:
+        low: lower bound.
+        high: upper bound.
+        shared: whether all entries of an environment have the same value.
+
+    Examples:
+        >>> Uniform(0.5, 1.0, shared=True)(torch.Size([4, 6])).shape
+        torch.Size([4, 1])
+    """
+
+    low: float
+    high: float
+    shared: bool = False
+
+    def __call__(self, shape: torch.Size) -> Tensor:
+        """Draw from torch's global generator."""
+        if self.shared:
+            shape = torch.Size((*shape[:-1], 1))
+        return self.low + (self.high - self.low) * torch.rand(shape)
+
+
+class EnvironmentTransform(Transform):
+    """A transform of environments, with the reason why stored data must not pass it."""
+
+    reason: ClassVar[str]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Refuse to work on stored data.
+
+        Raises:
+            RuntimeError: always.
+        """
+        raise RuntimeError(
+            f"{type(self).__name__} belongs to an environment (TransformedEnv), not to a replay "
+            f"buffer or a policy: {self.reason}"
+        )
+
+
+class HeldDisturbance(EnvironmentTransform):
+    """Holds the value of a disturbance, and its state: tensors whose first axes are the batch.
+
+    Subclasses say how an episode begins; the state is replaced, never written to, so that copies
+    of a transform do not share it.
+    """
+
+    what: ClassVar[str] = "entry"
+
+    def __init__(self, value: Value, key: NestedKey) -> None:
+        super().__init__()
+        self.key = key
+        self.draw: Draw | None = value if callable(value) else None
+        tensor = None if callable(value) else torch.as_tensor(value, dtype=torch.float64)
+        if tensor is not None and not tensor.isfinite().all():
+            raise ValueError(
+                f"{type(self).__name__} needs a finite number, or one for each {self.what} entry, "
+                f"got {value!r}"
+            )
+        if tensor is not None:
+            self._check(tensor)
+        self.register_buffer("value", tensor)
+        self._state: Mapping[str, Tensor] = {}
+
+    def _check(self, value: Tensor) -> None:
+        """Refuse values that the disturbance cannot have."""
+
+    def _require(self, sound: bool, rule: str, value: Tensor) -> None:
+        if not sound:
+            raise ValueError(f"{type(self).__name__}: {rule}, got {value.tolist()}")
+
+    def _begin(self, entry: Tensor) -> dict[str, Tensor]:
+        """The state at the start of an episode."""
+        return {}
+
+    def _drawn(self, entry: Tensor) -> dict[str, Tensor]:
+        if self.draw is None:
+            return {}
+        value = self.draw(entry.shape).to(entry.device)
+        self._check(value)
+        return {"value": value}
+
+    def _restart(self, entry: Tensor, reset: Tensor | None) -> None:
+        self._check_shape(entry)
+        state = self._drawn(entry)
+        self._keep(state, reset, entry.shape[:-1])
+        self._keep(self._begin(entry), reset, entry.shape[:-1])
+
+    def _started(self, entry: Tensor) -> None:
+        if not self._state:  # used without an environment that was reset
+            self._restart(entry, None)
+
+    def _keep(self, state: Mapping[str, Tensor], where: Tensor | None, batch: torch.Size) -> None:
+        """Make a state the current one, in some environments or in all."""
+        if where is not None:
+            chosen = where.reshape(*batch, -1).any(-1)
+            state = {
+                name: torch.where(_right(chosen, new), new, self._state[name])
+                if name in self._state and self._state[name].shape == new.shape
+                else new
+                for name, new in state.items()
+            }
+        self._state = {**self._state, **state}
+
+    def _current(self, entry: Tensor) -> Tensor:
+        """The value by which an entry is disturbed now."""
+        value = self._state["value"] if self.draw is not None else self.value
+        assert isinstance(value, Tensor)
+        return value.to(entry)
+
+    def _check_shape(self, entry: Tensor) -> None:
+        value, shape = self.value, entry.shape
+        if value is None or not value.ndim:
+            return
+        if value.ndim == 1 and value.shape != shape[-1:]:
+            raise ValueError(
+                f"{type(self).__name__} has {value.shape[-1]} values, but the {self.what} "
+                f"{self.key!r} has {shape[-1]} entries"
+            )
+        fits = value.shape[:-1] == shape[:-1] and value.shape[-1] in (1, shape[-1])
+        if value.ndim > 1 and not fits:
+            raise ValueError(
+                f"{type(self).__name__} has values of shape {tuple(value.shape)}, but the "
+                f"{self.what} {self.key!r} has shape {tuple(shape)}: one row for each environment"
+            )
+
+    def __repr__(self) -> str:
+        value = self.draw if self.value is None else self.value.tolist()
+        return f"{type(self).__name__}({value}, key={self.key!r})"
+
+
+def _right(mask: Tensor, entry: Tensor) -> Tensor:
+    return mask.reshape(*mask.shape, *(1,) * (entry.ndim - mask.ndim))
+
+
+class DelayLine(HeldDisturbance):
+    """Delivers what came in a number of steps ago."""
+
+    def _check(self, value: Tensor) -> None:
+        whole = (value >= 0) & (value == value.round())
+        self._require(bool(whole.all()), "steps must be whole and not negative", value)
+
+    def _line(self, entry: Tensor) -> Tensor:
+        """The last entries, oldest first ``(*batch, entries, length)``, as if all were this one."""
+        length = int(self._current(entry).max()) + 1
+        present = self._state.get("line")
+        # What is drawn for some must not shorten the memory of the others.
+        length = length if present is None else max(length, present.shape[-1])
+        return entry.unsqueeze(-1).expand(*entry.shape, length)
+
+    def _keep(self, state: Mapping[str, Tensor], where: Tensor | None, batch: torch.Size) -> None:
+        old, new = self._state.get("line"), state.get("line")
+        if old is not None and new is not None and (missing := new.shape[-1] - old.shape[-1]) > 0:
+            oldest = old[..., :1].expand(*old.shape[:-1], missing)
+            self._state = {**self._state, "line": torch.cat([oldest, old], -1)}
+        super()._keep(state, where, batch)
+
+    def _pass(self, entry: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        line = torch.cat([self._state["line"][..., 1:].to(entry), entry.unsqueeze(-1)], -1)
+        steps = self._current(entry).long().expand(entry.shape).unsqueeze(-1)
+        delivered = line.gather(-1, line.shape[-1] - 1 - steps).squeeze(-1)
+        return delivered, {"line": line}

@@ -1,0 +1,144 @@
+"""Disturbances of the observation on its way from the sensors.
+
+They are transforms for any TorchRL environment, batched or not, with a state of their own for
+every environment, which a reset renews for those that it resets. None is matched: no input changes
+what a sensor reads wrongly. Reward and termination come from the clean state.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
+from torchrl_l1.envs.disturbances import DelayLine, HeldDisturbance, Value
+
+
+class _Sensor(HeldDisturbance):
+    """A map of the observation, those of resets included."""
+
+    reason = "it must enter the data once, while they are collected"
+    what = "observation"
+    matched = False
+
+    def _first(self, reading: Tensor) -> Tensor:
+        """What is read at a reset."""
+        return reading
+
+    def _read(self, reading: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """What is read after a step, and the state then."""
+        raise NotImplementedError
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        reading = next_tensordict.get(self.key)
+        self._started(reading)
+        self._check_shape(reading)
+        seen, following = self._read(reading)
+        if following:
+            self._keep(following, tensordict.get("_step", None), reading.shape[:-1])
+        return next_tensordict.set(self.key, seen)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        reading, reset = tensordict_reset.get(self.key), tensordict.get("_reset", None)
+        self._restart(reading, reset)
+        seen = self._first(reading)
+        if reset is not None:
+            # The others' entries are those that they had, disturbed already.
+            chosen = reset.reshape(*reading.shape[:-1], -1).any(-1, keepdim=True)
+            seen = torch.where(chosen, seen, reading)
+        return tensordict_reset.set(self.key, seen)
+
+    _reset_on_native_autoreset = _reset
+
+
+class SensorBias(_Sensor):
+    """A constant on top of every observation.
+
+    Not matched.
+
+    Args:
+        bias: raw observation units; one number, one for each entry, one row for each environment
+            ``(*batch, 1 or entries)``, or drawn at resets.
+        observation_key: key of the observation.
+
+    Raises:
+        ValueError: if the bias is not finite or, at the first reset, has the wrong shape.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> env = TransformedEnv(GymEnv("InvertedPendulum-v5"), SensorBias([0.0, 0.05, 0.0, 0.0]))
+        >>> bool((env.reset()["observation"][1] > 0.03).all())  # within 0.01 of zero without it
+        True
+    """
+
+    def __init__(self, bias: Value, observation_key: NestedKey = "observation") -> None:
+        super().__init__(bias, observation_key)
+
+    def _first(self, reading: Tensor) -> Tensor:
+        return reading + self._current(reading)
+
+    def _read(self, reading: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        return self._first(reading), {}
+
+
+class SensorDelay(DelayLine, _Sensor):
+    """The observation of some steps ago; that of the reset before there was one.
+
+    Not matched.
+
+    Args:
+        steps: whole number; one, one for each entry, one row for each environment, or drawn at
+            resets.
+        observation_key: key of the observation.
+
+    Raises:
+        ValueError: if the steps are negative or not whole.
+    """
+
+    def __init__(self, steps: Value, observation_key: NestedKey = "observation") -> None:
+        super().__init__(steps, observation_key)
+
+    def _begin(self, entry: Tensor) -> dict[str, Tensor]:
+        return {"line": self._line(entry)}
+
+    def _read(self, reading: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        return self._pass(reading)
+
+
+class SensorDropout(_Sensor):
+    """Readings are lost at random; what was read last stands in for them.
+
+    Not matched. Draws come from torch's global generator.
+
+    Args:
+        probability: of each entry at each step, in ``[0, 1]``; as of :class:`SensorBias`.
+        whole: whether the entries of an observation are lost together.
+        observation_key: key of the observation.
+
+    Raises:
+        ValueError: if the probability is none.
+    """
+
+    def __init__(
+        self,
+        probability: Value,
+        whole: bool = False,
+        observation_key: NestedKey = "observation",
+    ) -> None:
+        super().__init__(probability, observation_key)
+        self.whole = whole
+
+    def _check(self, value: Tensor) -> None:
+        inside = (value >= 0) & (value <= 1)
+        self._require(bool(inside.all()), "a probability is between 0 and 1", value)
+
+    def _begin(self, entry: Tensor) -> dict[str, Tensor]:
+        return {"last": entry.clone()}
+
+    def _read(self, reading: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        shape = (*reading.shape[:-1], 1) if self.whole else reading.shape
+        lost = torch.rand(shape, device=reading.device) < self._current(reading)
+        seen = torch.where(lost, self._state["last"].to(reading), reading)
+        return seen, {"last": seen}
