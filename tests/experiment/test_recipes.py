@@ -261,6 +261,16 @@ NEWER = {"fit.precision": "float32", "precision": "float32"} | {
     for name, entry in DISTURBANCES.items()
     if name not in ("bias", "gain")
 }
+NEWER |= {
+    "l1.estimator": "least_squares",
+    "l1.filter": "low_pass",
+    "l1.covariance": "residuals",
+    "l1.dead_zone": 2.0,
+    "l1.process_noise": None,
+    "l1.inflation": None,
+    "l1.initial_deviation": 0.3,
+    "l1.forgetting": 0.97,
+}
 
 NEWER_IN_EVALUATIONS = {
     "suite": None,

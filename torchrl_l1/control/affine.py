@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from functools import partial
 from types import FunctionType
@@ -216,20 +217,13 @@ def _augment_kalman(
     observation: Tensor,
     u_rl: Tensor,
 ) -> tuple[Tensor, L1State, Callable[[], L1Diagnostics]]:
-    """As :func:`augment_silently`: here the input is known before the model is evaluated."""
+    """As :func:`augment_silently`: here the input is known before the model is expanded, at it."""
     u_rl = law.saturate(config, u_rl)
     # What the last step expected does not depend on where this one is.
     known = model.residual_statistics(observation, u_rl, "residuals")
     estimated = law.estimate(config, state, observation, known)
     u = law.adapted(config, estimated, u_rl)
-    if config.epsilon == 0:
-        switch, error = state.started, None
-        u_bar, change, jacobian = affinize(model, observation, u)
-    else:
-        u_bar = torch.where(state.started, state.u_bar, u)
-        switch, error, (u_bar, change, jacobian) = operating_point(
-            model, observation, u_bar, u, u, state.started, config.epsilon
-        )
+    u_bar, change, jacobian = affinize(model, observation, u)
     residuals = known
     if config.covariance != "residuals":
         residuals = model.residual_statistics(observation, u, config.covariance)
@@ -237,16 +231,9 @@ def _augment_kalman(
         config, state, estimated, observation, u_rl, change, jacobian, u_bar, residuals
     )
     following = following._replace(
-        u_bar=u_bar.masked_fill(terms.non_finite, 0.0), n_switch=state.n_switch + switch
+        u_bar=u_bar.masked_fill(terms.non_finite, 0.0), n_switch=state.n_switch + state.started
     )
-
-    def diagnostics() -> L1Diagnostics:
-        if error is None:
-            return law.diagnose(config, terms, switch)
-        counted = error.masked_fill(terms.non_finite | ~state.started, 0.0)
-        return law.diagnose(config, terms, switch, counted)
-
-    return u, following, diagnostics
+    return u, following, partial(law.diagnose, config, terms, state.started)
 
 
 def _tested_input(
@@ -282,6 +269,17 @@ def make_step(
         if diagnostics:
             return augment(config, model, state, observation, u_rl)
         return *augment_silently(config, model, state, observation, u_rl)[:2], None
+
+    known = ("residual_statistics", "residual_covariance")
+    if config.estimator == "weighted" and not any(
+        callable(getattr(model.dynamics, name, None)) for name in known
+    ):
+        warnings.warn(
+            f"estimator='weighted' knows no covariance of {type(model.dynamics).__name__}'s "
+            "residuals and takes the identity: give the model a residual_covariance(observation, "
+            "action), or fit an EnsembleDynamics, which measures its own",
+            stacklevel=3,
+        )
 
     # Environments keep their batch size, so graphs with free sizes would only cost: and torch
     # cannot make dual tensors of them, which forward-mode Jacobians need.

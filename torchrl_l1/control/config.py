@@ -71,8 +71,9 @@ class L1Config:
             ``"low_pass"`` filter, or a ``"kalman"`` filter, whose state is the matched
             disturbance as a random walk, see :mod:`torchrl_l1.control.kalman`. The latter weighs
             each step by how well the actions can be seen in it and acts on what is significant;
-            it needs no ``cutoff``, ``alpha``, ``a_s`` or ``filter_input``, and is kept at
-            switches.
+            it needs no ``cutoff``, ``alpha``, ``a_s`` or ``filter_input``. Its
+            input is known before the model is expanded, so that the operating point moves to the
+            executed input in every step and ``epsilon`` and ``switch_on`` do not matter.
         covariance: the covariance of the residuals that both use: of the model's validation
             ``"residuals"``, or of the model at each state and action, from its ``"heads"``, the
             ``"disagreement"`` of its members or the ``"sum"`` of all three.
@@ -220,14 +221,14 @@ class L1Config:
         return cls(dt, epsilon=epsilon, **(reference | settings))
 
     @classmethod
-    def robust(cls, dt: float, *, epsilon: float = 0.0, **settings: Any) -> L1Config:
+    def robust(cls, dt: float, **settings: Any) -> L1Config:
         """Kalman filter on covariance-weighted residuals, acting on what is significant.
 
         Not in the paper: it answers its open question about the covariance of probabilistic
-        models. With ``epsilon`` 0 the affine model sits at the executed input in every step.
+        models.
         """
         robust: dict[str, Any] = {"estimator": "weighted", "filter": "kalman"}
-        return cls(dt, epsilon=epsilon, **(robust | settings))
+        return cls(dt, **(robust | settings))
 
     @property
     def filter_gain(self) -> float:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
+from tensordict import TensorDict
 
 from torchrl_l1.algorithms import Algorithm
 from torchrl_l1.algorithms.collection import (
@@ -20,6 +21,7 @@ from torchrl_l1.algorithms.collection import (
     signal_metrics,
 )
 from torchrl_l1.algorithms.policy import kinds_of
+from torchrl_l1.dynamics.fit import one_step_residuals
 from torchrl_l1.envs import DISTURBANCES, Perturbation
 from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.l1_options import (
@@ -79,7 +81,21 @@ def load_run(path: str | Path) -> TrainedRun:
         here["compile_plans"] = False  # as "auto" decides on the CPU
     algorithm = replace(recipe, **here).build()
     algorithm.load_state_dict({**checkpoint["algorithm"], "buffer": {}})
+    _measure_residuals(algorithm, checkpoint["algorithm"]["buffer"], recipe)
     return TrainedRun(directory.path, recipe, algorithm)
+
+
+def _measure_residuals(algorithm: Algorithm, buffer: dict[str, Any], recipe: RunSettings) -> None:
+    """Residuals of models that were fitted before fits measured them, from the run's own data."""
+    dynamics = algorithm.acting_dynamics
+    if bool(dynamics.residuals.measured) or not buffer:
+        return
+    data = TensorDict(buffer).auto_batch_size_(1)
+    held_out = data[data["validation"].reshape(-1)]
+    if held_out.shape[0]:
+        label = getattr(recipe, "label", "nominal")
+        action = held_out["action" if label == "nominal" else "executed"]
+        dynamics.residuals.measure(one_step_residuals(dynamics, held_out.set("action", action)))
 
 
 def distinct(trained: TrainedRun, cells: Sequence[Condition]) -> list[Condition]:

@@ -12,36 +12,11 @@ from dataclasses import dataclass, field, fields
 from itertools import product
 from typing import Any
 
-import torch
-
 from torchrl_l1.algorithms.collection import ORACLE
 from torchrl_l1.algorithms.facts import KINDS
-from torchrl_l1.envs import DISTURBANCES, ActuatorBias, ActuatorGain
+from torchrl_l1.envs import DISTURBANCES, SUITES, suite
 from torchrl_l1.experiment.l1_options import OFF, UNTUNED, check_tuning, controller_label
 from torchrl_l1.experiment.settings import SCHEMAS
-
-# SHIM: until torchrl_l1.envs exports SUITES, suite and transforms that can compensate().
-_LEVELS: dict[str, dict[str, tuple[float, ...]]] = {
-    "bias": {"quick": (0.5,), "full": (0.25, 0.5, 1.0)},
-    "gain": {"quick": (0.6,), "full": (0.4, 0.6, 1.4)},
-}
-SUITES = ("quick", "full")
-
-
-def suite(name: str) -> list[dict[str, float]]:
-    """The cells of a suite."""
-    levels = [{what: v} for what, of in _LEVELS.items() for v in of[name]]
-    return [{}, *levels]
-
-
-def _undo_gain(action: torch.Tensor, gain: torch.Tensor) -> torch.Tensor:
-    return action / torch.where(gain == 0, torch.ones_like(gain), gain)
-
-
-for _kind, _undo in ((ActuatorBias, torch.sub), (ActuatorGain, _undo_gain)):
-    if not hasattr(_kind, "compensate"):
-        _kind.compensate = lambda self, action, _undo=_undo: _undo(action, self.value.to(action))
-# End of the shim.
 
 _STAGES = [stage.name for one in SCHEMAS.values() for stage in one.builds.facts.named_stages]
 
@@ -103,9 +78,9 @@ class Condition:
         ValueError: for a disturbance that there is not.
 
     Examples:
-        >>> Condition("paper", disturbances={"bias": 0.5}, epsilon=0.3).columns()
-        {'l1': 'paper', 'noise': 'none', 'bias': 0.5, 'gain': 1.0, 'policy': 'stochastic', \
-'epsilon': 0.3, 'alpha': None, 'stage': None}
+        >>> columns = Condition("paper", disturbances={"bias": 0.5}, epsilon=0.3).columns()
+        >>> [columns[name] for name in ("l1", "noise", "bias", "gain", "epsilon", "alpha")]
+        ['paper', 'none', 0.5, 1.0, 0.3, None]
     """
 
     l1: str = _varied(
@@ -158,8 +133,8 @@ def axes() -> list[Axis]:
     """All that an evaluation varies, in the order of the columns of its tables.
 
     Examples:
-        >>> [axis.name for axis in axes()]
-        ['l1', 'noise', 'bias', 'gain', 'policy', 'epsilon', 'alpha', 'stage']
+        >>> [axis.name for axis in axes() if axis.name not in DISTURBANCES]
+        ['l1', 'noise', 'policy', 'epsilon', 'alpha', 'stage']
     """
     found = []
     for part in fields(Condition):

@@ -43,6 +43,15 @@ class L1Settings:
         switch_on: the switching law looks at the ``policy`` action or the ``executed`` input.
         filter_input: the filter takes the ``current`` or the ``previous`` estimate.
         project: bound the estimate that enters the filter to the range of the action.
+        estimator: ``least_squares``, or ``weighted`` by the covariance of the residuals.
+        filter: ``low_pass``, or ``kalman``, which needs no ``alpha`` or ``cutoff``.
+        covariance: where it comes from: ``residuals``, ``heads``, ``disagreement`` or ``sum``.
+        dead_zone: posterior standard deviations within which the Kalman filter does nothing.
+        process_noise: change of the disturbance per step that it expects, fraction of half the
+            range of the action; the model's calibration if null.
+        inflation: factor on the covariance; the model's calibration if null.
+        initial_deviation: standard deviation of the disturbance at a reset, same units.
+        forgetting: factor per step of the running estimate of each state's noise; 1 for none.
         compile: compile the controller's step: ``true``, ``false``, or ``auto`` where a compiler
             works. It takes some tens of seconds and pays in long collections.
     """
@@ -56,6 +65,14 @@ class L1Settings:
     switch_on: str = "executed"
     filter_input: str = "previous"
     project: bool = True
+    estimator: str = "least_squares"
+    filter: str = "low_pass"
+    covariance: str = "residuals"
+    dead_zone: float = 2.0
+    process_noise: float | None = None
+    inflation: float | None = None
+    initial_deviation: float = 0.3
+    forgetting: float = 0.97
     compile: bool | str = False
 
 
@@ -194,6 +211,14 @@ def l1_config(settings: L1Settings, task_name: str) -> L1Config | None:
         switch_on=settings.switch_on,  # type: ignore[arg-type]
         filter_input=settings.filter_input,  # type: ignore[arg-type]
         project=settings.project,
+        estimator=settings.estimator,  # type: ignore[arg-type]
+        filter=settings.filter,  # type: ignore[arg-type]
+        covariance=settings.covariance,  # type: ignore[arg-type]
+        dead_zone=settings.dead_zone,
+        process_noise=settings.process_noise,
+        inflation=settings.inflation,
+        initial_deviation=settings.initial_deviation,
+        forgetting=settings.forgetting,
         action_low=task.action_low,
         action_high=task.action_high,
     )
