@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from matplotlib.ticker import NullLocator
 from torch import Tensor
 
-from torchrl_l1.control import ActionJacobian, L1Config
+from torchrl_l1.control import ActionJacobian, L1Config, init, solve_matched
 from torchrl_l1.control.affine import augment
-from torchrl_l1.control.law import init, solve_matched
 from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.report.page import markdown
 from torchrl_l1.report.style import color, grid, legend_below, save
@@ -620,6 +620,8 @@ def draw_floors(runs: Sequence[Row], file: Path) -> None:
     noises.legend(frameon=False, fontsize=8)
     for axis in (floors, noises):
         axis.set(xscale="log", yscale="log")
+    floors.set_xticks(list(epsilon), labels=[f"{value:g}" for value in epsilon])
+    floors.xaxis.set_minor_locator(NullLocator())
     save(figure, file)
 
 

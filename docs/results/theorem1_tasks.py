@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchrl_l1.control.law import solve_matched
+from torchrl_l1.control import solve_matched
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.run_directory import RunDirectory, write_table
