@@ -124,7 +124,7 @@ def test_a_suite_ends_in_a_table_of_what_is_recovered(
     main(["evaluate", str(directory), *options, "--output", str(tmp_path / "out")])
     printed = capsys.readouterr().out
     assert "inverted_pendulum: deterministic policy" in printed
-    assert "| L1 paper recovered |" in printed
+    assert " L1 paper recovered |" in printed
     rows = rows_of(tmp_path / "out" / "evaluation.csv")
     assert len(rows) == len(suite("quick")) * 3
     episodes = rows_of(tmp_path / "out" / "episodes.csv")

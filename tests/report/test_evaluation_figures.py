@@ -185,7 +185,7 @@ def test_a_tolerance_of_zero_stands_a_step_below_the_others(
 def test_of_many_disturbances_those_with_several_magnitudes_are_drawn(
     drawn: list[Figure], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    names = ["lag", "play", "load", "wind"]
+    names = ["lag", "play", "load", "sway"]
     for name in names:
         entry = replace(DISTURBANCES["bias"], name=name, setting=f"actuator_{name}")
         monkeypatch.setitem(DISTURBANCES, name, entry)
@@ -201,7 +201,7 @@ def test_of_many_disturbances_those_with_several_magnitudes_are_drawn(
     panels = [axis for axis in drawn[0].axes if axis.get_visible()]
     found = [(axis.get_xlabel().split()[1], axis.get_ylabel()[:10]) for axis in panels]
     # Four across, each difference below its return.
-    first, last = ["bias", "lag", "play", "load"], ["wind"]
+    first, last = ["bias", "lag", "play", "load"], ["sway"]
     assert found == [
         (name, words)
         for group in (first, last)

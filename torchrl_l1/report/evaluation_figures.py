@@ -15,6 +15,7 @@ from matplotlib.ticker import NullLocator
 from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.l1_options import controller_label
+from torchrl_l1.experiment.matrix import disturbed
 from torchrl_l1.report.identity import BASELINE
 from torchrl_l1.report.study import noise_order
 from torchrl_l1.report.style import (
@@ -191,10 +192,10 @@ def _tested(row: Row) -> tuple[str, str, str]:
 def _varied(rows: Sequence[Row]) -> dict[str, list[Row]]:
     """By name of a disturbance that varies, the rows in which all others are neutral."""
     found = {}
-    for what in DISTURBANCES:
-        others = [(name, entry.neutral) for name, entry in DISTURBANCES.items() if name != what]
-        chosen = [row for row in rows if all(row[name] == value for name, value in others)]
-        if len({row[what] for row in chosen}) > 1:
+    for what, entry in DISTURBANCES.items():
+        chosen = [row for row in rows if disturbed(row).keys() <= {what}]
+        # Tables that are older than a disturbance have no column of it.
+        if len({row.get(what, entry.neutral) for row in chosen}) > 1:
             found[what] = chosen
     return found
 
@@ -376,7 +377,7 @@ def _along(values: Iterable[float]) -> dict[float, float]:
 
 
 def _condition(row: Row) -> tuple[Any, ...]:
-    return row["noise"], *(row[name] for name in DISTURBANCES)
+    return row["noise"], *(row.get(name, entry.neutral) for name, entry in DISTURBANCES.items())
 
 
 def _distance(disturbances: Sequence[float]) -> tuple[float, ...]:
@@ -390,8 +391,9 @@ def _words(condition: tuple[Any, ...]) -> str:
     """A condition in the title of a panel.
 
     Examples:
-        >>> _words(("none", 1.0, 1.0)), _words(("action", 0.0, 0.6)), _words(("none", 0.0, 1.0))
-        ('bias 1', 'noise: action, gain 0.6', 'undisturbed')
+        >>> rows = [{"noise": "none"}, {"noise": "action", "gain": 0.6}]
+        >>> [_words(_condition(row)) for row in rows]
+        ['undisturbed', 'noise: action, gain 0.6']
     """
     noise, *values = condition
     words = [f"noise: {noise}"] * (noise != "none")
