@@ -95,6 +95,23 @@ def noise_ratio(covariance: Tensor, jacobian: Tensor, posterior: Posterior, left
     return (left.square() + unseen) / covariance.diagonal(dim1=-2, dim2=-1)
 
 
+def doubt(jacobian: Tensor, innovation: Tensor, change: Tensor) -> Tensor:
+    r"""Factor on the covariance of one residual that is larger than expected: ``(..., 1)``.
+
+    The mean square of what an update leaves unexplained, in white coordinates, and never below one:
+    the weight of an observation with heavy-tailed noise, of one step of iteratively reweighted
+    least squares. Contacts that the model misses, and the first steps of a sensor that is worse
+    than expected, would otherwise be taken for a disturbance with confidence.
+
+    Args:
+        jacobian: whitened input matrix ``(..., n, m)``.
+        innovation: whitened ``(..., n)``.
+        change: of the disturbance's mean by the update ``(..., m)``.
+    """
+    left = innovation - (jacobian @ change.unsqueeze(-1)).squeeze(-1)
+    return left.square().mean(-1, keepdim=True).clamp_min(1.0)
+
+
 def significant(posterior: Posterior, dead_zone: float) -> Tensor:
     r"""The part of the disturbance that is acted on, entry by entry: ``(..., m)``.
 

@@ -265,7 +265,8 @@ def estimate(
 
     with :math:`\Lambda` the inflated covariance of the residuals. The squares of the diagonal
     :math:`D_t`, never below one, are a running mean of :func:`~.kalman.noise_ratio`: a state
-    whose sensor has become noisy loses its weight.
+    whose sensor has become noisy loses its weight. A single residual beyond expectation loses it
+    at once, see :func:`~.kalman.doubt`.
 
     Args:
         config: the settings.
@@ -301,8 +302,12 @@ def estimate(
     noise = state.noise.masked_fill(fresh, 1.0)
     scale = noise.clamp_min(1.0).sqrt().unsqueeze(-1)
     columns, white = whitened(covariance, jacobian / scale, innovation.unsqueeze(-1) / scale)
-    posterior = kalman.measurement_update(prior, columns, white.squeeze(-1))
+    white = white.squeeze(-1)
+    posterior = kalman.measurement_update(prior, columns, white)
     if config.forgetting < 1:
+        # A residual far beyond what is expected counts for as much less, at once.
+        doubt = kalman.doubt(columns, white, posterior.mean - prior.mean).sqrt()
+        posterior = kalman.measurement_update(prior, columns / doubt.unsqueeze(-1), white / doubt)
         left = residual - (jacobian @ posterior.mean.unsqueeze(-1)).squeeze(-1)
         ratio = kalman.noise_ratio(covariance, jacobian, posterior, left)
         noise = torch.where(fresh, noise, torch.lerp(ratio, noise, config.forgetting))
