@@ -225,9 +225,9 @@ class L1Config:
         """Kalman filter on covariance-weighted residuals, acting on what is significant.
 
         Not in the paper: it answers its open question about the covariance of probabilistic
-        models. The covariance is taken three times, since residuals of neighbouring steps are alike:
-        the smallest of 1, 3, 10 and 30 that left undisturbed METRPO policies of Hopper and Walker
-        (seed 1) alone.
+        models. The covariance is taken three times, since residuals of neighbouring steps are
+        alike: the smallest of 1, 3, 10 and 30 that left undisturbed METRPO policies of Hopper and
+        Walker (seed 1) alone.
         """
         robust: dict[str, Any] = {"estimator": "weighted", "filter": "kalman", "inflation": 3.0}
         return cls(dt, **(robust | settings))
