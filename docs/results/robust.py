@@ -1,0 +1,124 @@
+"""Frozen policies with L1 off, the paper's, the robust controller and the oracle, joined.
+
+    python docs/results/robust.py [FOLDER]
+
+Reads the tables that `torchrl-l1 evaluate` wrote into FOLDER/TASK/seed_N/bias and .../noise, if a
+FOLDER is given, and keeps their episodes in `robust/TASK.csv` beside this file. Writes from those
+`robust/TASK.md`, `robust/harm.md` and `robust/TASK.png`.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_l1.algorithms import METRPO
+from torchrl_l1.experiment.matrix import disturbance_words
+from torchrl_l1.experiment.run_directory import write_table
+from torchrl_l1.report.evaluation_summary import summarize, summary_lines
+from torchrl_l1.report.page import markdown
+from torchrl_l1.report.recovery import MEDIANS, plot_heat_map
+
+HERE = Path(__file__).with_name("robust")
+TASKS = ("inverted_pendulum", "swimmer", "hopper", "walker", "half_cheetah")
+KEPT = ("run", "l1", "noise", "bias", "signs", "policy", "episode", "return", "steps")
+NUMBERS = ("bias", "signs", "episode", "return", "steps")
+Row = dict[str, Any]
+
+
+def read(file: Path) -> list[Row]:
+    """Episodes of a table, with numbers as numbers."""
+    with file.open(newline="") as handle:
+        return [
+            {name: float(row[name]) if name in NUMBERS else row[name] for name in KEPT}
+            for row in csv.DictReader(handle)
+        ]
+
+
+def gather(folder: Path, task: str) -> None:
+    """Keep the episodes of all seeds of a task in one file."""
+    rows = []
+    for file in sorted(folder.glob(f"{task}/seed_*/*/episodes.csv")):
+        rows += [{**row, "run": file.parts[-3]} for row in read(file)]
+    # Undisturbed episodes are those of the tests of biases.
+    if rows:
+        HERE.mkdir(exist_ok=True)
+        write_table(HERE / f"{task}.csv", rows)
+
+
+def conditions(episodes: Sequence[Row]) -> list[Row]:
+    """One row per run and condition, as `summarize` takes them."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in episodes:
+        groups.setdefault(tuple(row[name] for name in KEPT[:6]), []).append(row)
+    return [
+        {
+            **{name: value for name, value in zip(KEPT[:6], key, strict=True)},
+            "return_mean": float(np.mean([row["return"] for row in members])),
+            "episodes": len(members),
+        }
+        for key, members in groups.items()
+    ]
+
+
+def harm(episodes: Sequence[Row], noise: str, l1: str, draws: int = 4000) -> dict[str, str]:
+    """Return less that without L1, in per cent of the latter: mean, and 95 % interval."""
+    of: dict[tuple[str, str], np.ndarray] = {}
+    runs = sorted({row["run"] for row in episodes})
+    for run in runs:
+        for option in ("off", l1):
+            returns = [
+                row["return"]
+                for row in episodes
+                if (row["run"], row["l1"], row["noise"]) == (run, option, noise)
+                and row["bias"] == 0 == row["signs"]
+            ]
+            of[run, option] = np.array(returns)
+    differences = [of[run, l1] - of[run, "off"] for run in runs]
+    scale = abs(np.mean([of[run, "off"].mean() for run in runs])) / 100
+    rng = np.random.default_rng(0)
+    means = []
+    for _ in range(draws):
+        chosen = rng.integers(len(runs), size=len(runs))
+        drawn = [rng.choice(differences[one], len(differences[one])).mean() for one in chosen]
+        means.append(np.mean(drawn) / scale)
+    low, high = np.percentile(means, [2.5, 97.5])
+    mean = np.mean([one.mean() for one in differences]) / scale
+    return {"mean": f"{mean:+.1f}", "interval": f"[{low:+.1f}, {high:+.1f}]"}
+
+
+def main() -> None:
+    """Read what is new, then write all tables and figures."""
+    lines = []
+    for task in TASKS:
+        if len(sys.argv) > 1:
+            gather(Path(sys.argv[1]), task)
+        file = HERE / f"{task}.csv"
+        if not file.exists():
+            continue
+        episodes = read(file)
+        summary = summarize(conditions(episodes), episodes)
+        biased = [row for row in summary if row["noise"] == "none"]
+        (HERE / f"{task}.md").write_text(markdown(summary_lines(biased)) + "\n")
+        plot_heat_map(biased, MEDIANS, task, HERE / f"{task}.png", METRPO.facts)
+        for noise in ("none", "action", "observation"):
+            line = {"task": task, "policies": str(len({r["run"] for r in episodes}))}
+            line |= {"noise": noise}
+            for l1 in ("paper", "robust"):
+                found = harm(episodes, noise, l1)
+                line[f"L1 {l1}, %"] = f"{found['mean']} {found['interval']}"
+            lines.append(line)
+        for row in biased:
+            if row["l1"] == "robust" and "recovered" in row:
+                print(task, disturbance_words(row), f"{row['recovered']:.2f}")
+    (HERE / "harm.md").write_text(markdown(lines) + "\n")
+    print(f"Tables and figures: {HERE}")
+
+
+if __name__ == "__main__":
+    main()
