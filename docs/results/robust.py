@@ -106,7 +106,7 @@ def main() -> None:
         biased = [row for row in summary if row["noise"] == "none"]
         (HERE / f"{task}.md").write_text(markdown(summary_lines(biased)) + "\n")
         plot_heat_map(biased, MEDIANS, task, HERE / f"{task}.png", METRPO.facts)
-        for noise in ("none", "action", "observation"):
+        for noise in dict.fromkeys(row["noise"] for row in episodes):
             line = {"task": task, "policies": str(len({r["run"] for r in episodes}))}
             line |= {"noise": noise}
             for l1 in ("paper", "robust"):

@@ -264,8 +264,9 @@ def estimate(
         w_t \sim N(0, D_t \Lambda D_t)
 
     with :math:`\Lambda` the inflated covariance of the residuals. The squares of the diagonal
-    :math:`D_t`, never below one, are a running mean of :func:`~.kalman.noise_ratio`: a state
-    whose sensor has become noisy loses its weight. A single residual beyond expectation loses it
+    :math:`D_t` are a running mean of :func:`~.kalman.noise_ratio`, none below one, times their
+    mean over the states: a state whose sensor has become noisy loses its weight, and all do where
+    many have. A single residual beyond expectation loses it
     at once, see :func:`~.kalman.doubt`.
 
     Args:
@@ -300,7 +301,10 @@ def estimate(
 
     covariance = _expected_covariance(config, state, statistics, fresh)
     noise = state.noise.masked_fill(fresh, 1.0)
-    scale = noise.clamp_min(1.0).sqrt().unsqueeze(-1)
+    larger = noise.clamp_min(1.0)
+    # From observations that are noisier than its data were, a model errs in a lasting way too: the
+    # policy reacts to the noise, and the mean of a nonlinear function is not that of its argument.
+    scale = (larger * larger.mean(-1, keepdim=True)).sqrt().unsqueeze(-1)
     columns, white = whitened(covariance, jacobian / scale, innovation.unsqueeze(-1) / scale)
     white = white.squeeze(-1)
     posterior = kalman.measurement_update(prior, columns, white)
