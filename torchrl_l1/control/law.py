@@ -266,8 +266,8 @@ def estimate(
     with :math:`\Lambda` the inflated covariance of the residuals. The squares of the diagonal
     :math:`D_t` are a running mean of :func:`~.kalman.noise_ratio`, none below one, times their
     mean over the states: a state whose sensor has become noisy loses its weight, and all do where
-    many have. A single residual beyond expectation loses it
-    at once, see :func:`~.kalman.doubt`.
+    many have. A single residual beyond expectation loses it at once, see
+    :func:`~.kalman.doubt`.
 
     Args:
         config: the settings.
