@@ -81,9 +81,9 @@ class L1Config:
             filter's estimate is not acted on; 0 acts on all of it.
         process_noise: standard deviation of the disturbance's change per step, as a fraction
             of half the range of the action (of one action unit without bounds). If ``None``, what
-            the model's calibration found, or else 0.003.
+            the model says of itself, or else 0.003.
         inflation: factor on the covariance, since residuals are neither white nor normal. If
-            ``None``, what the model's calibration found, or else 1.
+            ``None``, what the model says of itself, or else 1.
         initial_deviation: standard deviation of the disturbance at a reset, in the units of
             ``process_noise``.
         forgetting: factor per step of the running estimate of how noisy each state is, which

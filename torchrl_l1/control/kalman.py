@@ -130,3 +130,11 @@ def significant(posterior: Posterior, dead_zone: float) -> Tensor:
     variance = posterior.covariance.diagonal(dim1=-2, dim2=-1)
     square = posterior.mean.square().clamp_min(torch.finfo(variance.dtype).tiny)
     return posterior.mean * (1 - dead_zone**2 * variance / square).clamp_min(0)
+
+
+def summary(posterior: Posterior) -> tuple[Tensor, Tensor]:
+    """Norm of the standard deviations, and the mean's largest entry in them, each ``(..., 1)``."""
+    deviation = posterior.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    relative = posterior.mean.abs() / deviation.clamp_min(torch.finfo(deviation.dtype).tiny)
+    norm = torch.linalg.vector_norm(deviation, dim=-1, keepdim=True)
+    return norm, relative.amax(-1, keepdim=True)

@@ -464,12 +464,8 @@ def _significance(posterior: Posterior | None, like: Tensor) -> dict[str, Tensor
     if posterior is None:
         zero = torch.zeros_like(like)
         return {"posterior_deviation": zero, "significance": zero}
-    deviation = posterior.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-    tiny = torch.finfo(deviation.dtype).tiny
-    return {
-        "posterior_deviation": torch.linalg.vector_norm(deviation, dim=-1, keepdim=True),
-        "significance": (posterior.mean.abs() / deviation.clamp_min(tiny)).amax(-1, keepdim=True),
-    }
+    deviation, significance = kalman.summary(posterior)
+    return {"posterior_deviation": deviation, "significance": significance}
 
 
 def _check_shapes(

@@ -304,10 +304,8 @@ class EnsembleDynamics(nn.Module):
     def residual_statistics(
         self, observation: Tensor, action: Tensor, source: str = "residuals"
     ) -> ResidualStatistics:
-        """:meth:`residual_covariance` and what its calibration found, for the L1 controller."""
-        covariance = self.residual_covariance(observation, action, source)
-        known = self.residuals
-        return ResidualStatistics(covariance, known.inflation, known.process_noise)
+        """:meth:`residual_covariance`, as the L1 controller takes it."""
+        return ResidualStatistics(self.residual_covariance(observation, action, source))
 
     def _over_elites(self, per_member: Tensor) -> Tensor:
         """Mean of ``(E, ...)`` over the elites."""

@@ -17,30 +17,20 @@ class Residuals(nn.Module):
     Attributes:
         covariance: second moments of the residuals, shrunk, ``(n, n)``, state units squared; the
             identity until they are measured.
-        inflation: factor on the covariance that makes a Kalman filter's posterior honest, ``()``.
-        process_noise: standard deviation of a matched disturbance's change per step, as a
-            fraction of half the range of the action, ``()``.
         measured: whether the covariance is of data, ``()``, bool.
-        calibrated: whether inflation and process noise are, ``()``, bool.
     """
 
     covariance: Tensor
-    inflation: Tensor
-    process_noise: Tensor
     measured: Tensor
-    calibrated: Tensor
 
     def __init__(self, dim: int) -> None:
         super().__init__()
         self.register_buffer("covariance", torch.eye(dim))
-        self.register_buffer("inflation", torch.tensor(1.0))
-        self.register_buffer("process_noise", torch.tensor(0.003))
         self.register_buffer("measured", torch.tensor(False))
-        self.register_buffer("calibrated", torch.tensor(False))
 
     @torch.no_grad()
     def measure(self, residual: Tensor) -> None:
-        """Take over the covariance of residuals ``(N, n)``; a calibration no longer holds.
+        """Take over the covariance of residuals ``(N, n)``.
 
         Raises:
             ValueError: for residuals that are not finite, of the wrong width, or none.
@@ -54,14 +44,6 @@ class Residuals(nn.Module):
             raise ValueError("residuals have entries that are not finite: leave them out first")
         self.covariance.copy_(shrunk_covariance(residual))
         self.measured.fill_(True)
-        self.calibrated.fill_(False)
-
-    @torch.no_grad()
-    def calibrate(self, inflation: float, process_noise: float) -> None:
-        """Take over what a calibration found."""
-        self.inflation.fill_(inflation)
-        self.process_noise.fill_(process_noise)
-        self.calibrated.fill_(True)
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any

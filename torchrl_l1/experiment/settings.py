@@ -48,8 +48,8 @@ class L1Settings:
         covariance: where it comes from: ``residuals``, ``heads``, ``disagreement`` or ``sum``.
         dead_zone: posterior standard deviations within which the Kalman filter does nothing.
         process_noise: change of the disturbance per step that it expects, fraction of half the
-            range of the action; the model's calibration if null.
-        inflation: factor on the covariance; the model's calibration if null.
+            range of the action; 0.003 if null.
+        inflation: factor on the covariance; 1 if null.
         initial_deviation: standard deviation of the disturbance at a reset, same units.
         forgetting: factor per step of the running estimate of each state's noise; 1 for none.
         compile: compile the controller's step: ``true``, ``false``, or ``auto`` where a compiler

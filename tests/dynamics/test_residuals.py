@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+
+from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.dynamics.fit import one_step_residuals
+from torchrl_l1.dynamics.heads import GaussianHead
+from torchrl_l1.dynamics.residuals import Residuals, shrunk_covariance
+
+
+def test_many_residuals_have_the_covariance_that_they_were_drawn_from():
+    rng = np.random.default_rng(0)
+    factor = rng.normal(size=(4, 4)) * np.array([[0.01], [0.1], [1.0], [3.0]])
+    rows = torch.as_tensor(rng.normal(size=(20_000, 4)) @ factor.T)
+    found = shrunk_covariance(rows).numpy()
+    expected = factor @ factor.T
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(found / scale, expected / scale, atol=0.04)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    count=st.integers(1, 30),
+    n=st.integers(1, 12),
+    idle=st.integers(0, 3),
+    scale=st.floats(1e-4, 1e4),
+)
+def test_the_covariance_is_positive_definite_whatever_the_residuals(seed, count, n, idle, scale):
+    generator = torch.Generator().manual_seed(seed)
+    rows = scale * torch.randn(count, n, generator=generator)
+    rows[:, : min(idle, n)] = 0.0
+    covariance = shrunk_covariance(rows)
+    assert covariance.isfinite().all() and torch.linalg.cholesky_ex(covariance).info == 0
+    torch.testing.assert_close(covariance, covariance.T)
+
+
+def test_a_constant_error_counts():
+    assert shrunk_covariance(torch.full((10, 1), 2.0)).item() == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize(
+    ("residual", "words"),
+    [
+        (torch.zeros(0, 3), "at least 1"),
+        (torch.zeros(5, 2), r"\(N, 3\)"),
+        (torch.full((5, 3), torch.nan), "not finite"),
+    ],
+)
+def test_residuals_that_say_nothing_are_refused(residual, words):
+    residuals = Residuals(3)
+    with pytest.raises(ValueError, match=words):
+        residuals.measure(residual)
+    assert not residuals.measured and torch.equal(residuals.covariance, torch.eye(3))
+
+
+def test_older_checkpoints_load_and_newer_ones_keep_what_was_measured():
+    torch.manual_seed(0)
+    model = EnsembleDynamics(3, 1, members=2, hidden=(4,))
+    model.residuals.measure(torch.randn(50, 3))
+    state = model.state_dict()
+    copy = EnsembleDynamics(3, 1, members=2, hidden=(4,))
+    copy.load_state_dict(state)
+    assert copy.residuals.measured
+    assert torch.equal(copy.residuals.covariance, model.residuals.covariance)
+    older = {key: value for key, value in state.items() if not key.startswith("residuals.")}
+    copy.load_state_dict(older)
+    assert not copy.residuals.measured
+
+
+def test_sources_of_the_covariance_add_up():
+    torch.manual_seed(1)
+    model = EnsembleDynamics(3, 2, members=4, hidden=(8,), head=GaussianHead(3))
+    model.set_elites([0, 2, 3])
+    model.residuals.measure(torch.randn(200, 3))
+    x, u = torch.randn(6, 3), torch.randn(6, 2)
+    known = model.residual_covariance(x, u)
+    heads, apart, total = (
+        model.residual_covariance(x, u, source) for source in ("heads", "disagreement", "sum")
+    )
+    torch.testing.assert_close(total, heads + apart + (1 - 0.02) * known)
+    changes = model.member_changes(x, u)[[0, 2, 3]]
+    expected = torch.stack([torch.cov(changes[:, row].T) for row in range(6)])
+    torch.testing.assert_close(apart - 0.01 * known, expected, atol=1e-6, rtol=1e-4)
+    assert torch.linalg.cholesky_ex(apart).info.eq(0).all()
+    with pytest.raises(ValueError, match="source"):
+        model.residual_covariance(x, u, "guess")
+
+
+def test_one_step_residuals_are_what_the_mean_misses():
+    torch.manual_seed(2)
+    model = EnsembleDynamics(3, 1, members=2, hidden=(4,))
+    x, u, missed = torch.randn(7, 3), torch.randn(7, 1), torch.randn(7, 3)
+    with torch.no_grad():
+        following = x + model.mean_change(x, u) + missed
+    data = TensorDict(
+        {"observation": x, "action": u, "next": {"observation": following}}, batch_size=[7]
+    )
+    torch.testing.assert_close(one_step_residuals(model, data, chunk=3), missed)
