@@ -169,7 +169,7 @@ def test_a_bias_is_cancelled_and_its_absence_left_alone():
     deviation = torch.tensor([0.01, 0.1, 1.0])
     jacobian = torch.tensor([[0.02, 0.0], [0.1, 0.1], [0.5, -0.5]])
     noise = torch.randn(300, 200, 3, generator=generator) * deviation
-    config = L1Config.robust(0.05, inflation=1.0, **BOUNDS)
+    config = L1Config.robust(0.05, inflation=1.0, process_noise=0.003, **BOUNDS)
     statistics = ResidualStatistics(torch.diag(deviation.square()))
     bias = torch.tensor([0.3, -0.3]).expand(200, 2)
     _, _, inputs = simulate(config, statistics, jacobian, bias, noise)

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
 from typing import Any, ClassVar, Protocol, TypedDict
@@ -20,7 +20,7 @@ from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.algorithms.model_learning import FIT_METRICS, ModelLearning, fit_metrics
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config
-from torchrl_l1.dynamics import FitConfig, make_dynamics
+from torchrl_l1.dynamics import FitConfig, calibrate_filter, make_dynamics
 from torchrl_l1.dynamics.network import model_precision
 from torchrl_l1.envs import Perturbation, get_task
 
@@ -128,7 +128,7 @@ class Algorithm(ABC):
         compile_l1: CompileMode = False,
         on_phase: Callable[[str], None] | None = None,
     ) -> None:
-        self.config, self.seed = config, seed
+        self.config, self.l1, self.seed = config, l1, seed
         self.device = resolve_device(device)
         self.on_phase = on_phase or (lambda phase: None)
         self.task = get_task(task)
@@ -192,7 +192,25 @@ class Algorithm(ABC):
         with self.phase("fit"):
             report = self.learning.fit(lambda epoch: self.on_phase(f"fit, epoch {epoch}"))
             self.acting_dynamics.load_state_dict(self.dynamics.state_dict())
+            self._calibrate_filter()
         return fit_metrics(report)
+
+    def _calibrate_filter(self) -> None:
+        """Where a Kalman filter acts, fit it to what the model misses now."""
+        if self.l1 is None or self.l1.filter != "kalman":
+            return
+        residuals = self.acting_dynamics.residuals
+        config = replace(
+            self.l1, action_low=self.task.action_low, action_high=self.task.action_high
+        )
+        calibrate_filter(
+            residuals,
+            self.acting_dynamics.value_and_jacobian,
+            self.learning.buffer[:],
+            config,
+            self.learning.action_key,
+        )
+        self.dynamics.residuals.load_state_dict(residuals.state_dict())
 
     def complete(self, real_steps: int, metrics: Mapping[str, float]) -> IterationResult:
         """End the outer iteration after so many real steps in all."""

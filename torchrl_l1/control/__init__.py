@@ -12,6 +12,7 @@ from torchrl_l1.control.affine import (
     switching_law,
 )
 from torchrl_l1.control.affinizer import Affinizer
+from torchrl_l1.control.calibration import Calibration, calibrate
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.controller import L1Controller
 from torchrl_l1.control.jacobian import ActionJacobian, DynamicsModel
@@ -26,6 +27,7 @@ __all__ = [
     "AffineModel",
     "Affinization",
     "Affinizer",
+    "Calibration",
     "DynamicsModel",
     "L1Config",
     "L1Controller",
@@ -36,6 +38,7 @@ __all__ = [
     "ResidualStatistics",
     "affinize",
     "augment",
+    "calibrate",
     "init",
     "solve_matched",
     "step",

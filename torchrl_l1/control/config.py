@@ -81,7 +81,7 @@ class L1Config:
             filter's estimate is not acted on; 0 acts on all of it.
         process_noise: standard deviation of the disturbance's change per step, as a fraction
             of half the range of the action (of one action unit without bounds). If ``None``, what
-            the model says of itself, or else 0.003.
+            the model says of itself, see :func:`~torchrl_l1.control.calibrate`, or else 0.01.
         inflation: factor on the covariance, since residuals are neither white nor normal. If
             ``None``, what the model says of itself, or else 1.
         initial_deviation: standard deviation of the disturbance at a reset, in the units of
@@ -225,11 +225,10 @@ class L1Config:
         """Kalman filter on covariance-weighted residuals, acting on what is significant.
 
         Not in the paper: it answers its open question about the covariance of probabilistic
-        models. The covariance is taken three times, since residuals of neighbouring steps are
-        alike: the smallest of 1, 3, 10 and 30 that left undisturbed METRPO policies of Hopper and
-        Walker (seed 1) alone.
+        models. Inflation and process noise are those of the model, found by
+        :func:`~torchrl_l1.control.calibrate` where there are undisturbed episodes.
         """
-        robust: dict[str, Any] = {"estimator": "weighted", "filter": "kalman", "inflation": 3.0}
+        robust: dict[str, Any] = {"estimator": "weighted", "filter": "kalman"}
         return cls(dt, **(robust | settings))
 
     @property

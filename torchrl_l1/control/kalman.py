@@ -25,13 +25,13 @@ def time_update(covariance: Tensor, process_noise: Tensor | float) -> Tensor:
 
     Args:
         covariance: ``(..., m, m)``.
-        process_noise: standard deviation of the walk's step, ``(m,)`` or a number.
+        process_noise: standard deviation of the walk's step, ``(..., m)`` or a number.
 
     Returns:
         ``(..., m, m)``.
     """
     variance = torch.as_tensor(process_noise, dtype=covariance.dtype, device=covariance.device)
-    variance = variance.square().expand(covariance.shape[-1])
+    variance = variance.square().expand(covariance.shape[:-1])
     return covariance + torch.diag_embed(variance)
 
 

@@ -14,6 +14,7 @@ from torchrl_l1.dynamics.heads import HEADS, DeterministicHead, GaussianHead, He
 from torchrl_l1.dynamics.imagination import EnsembleModelEnv, EnsembleWorldModel, imagine
 from torchrl_l1.dynamics.model import EnsembleDynamics
 from torchrl_l1.dynamics.normalizer import DataBox, Normalizer
+from torchrl_l1.dynamics.residuals import calibrate_filter
 
 __all__ = [
     "HEADS",
@@ -31,6 +32,7 @@ __all__ = [
     "GaussianHead",
     "Head",
     "Normalizer",
+    "calibrate_filter",
     "evaluate_members",
     "fit_ensemble",
     "imagine",

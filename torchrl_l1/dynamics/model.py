@@ -305,7 +305,11 @@ class EnsembleDynamics(nn.Module):
         self, observation: Tensor, action: Tensor, source: str = "residuals"
     ) -> ResidualStatistics:
         """:meth:`residual_covariance`, as the L1 controller takes it."""
-        return ResidualStatistics(self.residual_covariance(observation, action, source))
+        return ResidualStatistics(
+            self.residual_covariance(observation, action, source),
+            self.residuals.inflation,
+            self.residuals.process_noise,
+        )
 
     def _over_elites(self, per_member: Tensor) -> Tensor:
         """Mean of ``(E, ...)`` over the elites."""

@@ -21,6 +21,8 @@ from torchrl_l1.algorithms.collection import (
     signal_metrics,
 )
 from torchrl_l1.algorithms.policy import kinds_of
+from torchrl_l1.control import L1Config
+from torchrl_l1.dynamics import calibrate_filter
 from torchrl_l1.dynamics.fit import one_step_residuals
 from torchrl_l1.envs import DISTURBANCES, Perturbation
 from torchrl_l1.experiment.errors import RunDirectoryError
@@ -86,16 +88,18 @@ def load_run(path: str | Path) -> TrainedRun:
 
 
 def _measure_residuals(algorithm: Algorithm, buffer: dict[str, Any], recipe: RunSettings) -> None:
-    """Residuals of models that were fitted before fits measured them, from the run's own data."""
-    dynamics = algorithm.acting_dynamics
-    if bool(dynamics.residuals.measured) or not buffer:
+    """From the run's own data, what training without a Kalman filter has not measured."""
+    dynamics, task = algorithm.acting_dynamics, algorithm.task
+    if not buffer:
         return
     data = TensorDict(buffer).auto_batch_size_(1)
+    action_key = "action" if getattr(recipe, "label", "nominal") == "nominal" else "executed"
     held_out = data[data["validation"].reshape(-1)]
-    if held_out.shape[0]:
-        label = getattr(recipe, "label", "nominal")
-        action = held_out["action" if label == "nominal" else "executed"]
-        dynamics.residuals.measure(one_step_residuals(dynamics, held_out.set("action", action)))
+    if not bool(dynamics.residuals.measured) and held_out.shape[0]:
+        held_out = held_out.set("action", held_out[action_key])
+        dynamics.residuals.measure(one_step_residuals(dynamics, held_out))
+    config = L1Config.robust(task.dt, action_low=task.action_low, action_high=task.action_high)
+    calibrate_filter(dynamics.residuals, dynamics.value_and_jacobian, data, config, action_key)
 
 
 def distinct(trained: TrainedRun, cells: Sequence[Condition]) -> list[Condition]:
