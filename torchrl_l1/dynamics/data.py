@@ -110,9 +110,10 @@ def read_npz(
         ValueError: if arrays are not numbers of one length, or the file is none of NumPy's.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            if not isinstance(file, np.lib.npyio.NpzFile):
-                raise ValueError("a single array; save several by name with numpy.savez")
+        file = np.load(path, allow_pickle=False)
+        if isinstance(file, np.ndarray):
+            raise ValueError("a single array; save several by name with numpy.savez")
+        with file:
             arrays = {name: file[name] for name in file.files}
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such file") from None
