@@ -11,7 +11,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.data import Composite, TensorSpec
-from torchrl.envs.transforms import TensorDictPrimer
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import TensorDictPrimer, Transform
 
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control.affine import StepFunction, make_step
@@ -26,9 +27,17 @@ from torchrl_l1.control.layout import (
     declared_dimension,
     required_entry,
 )
-from torchrl_l1.control.pipeline import Settings, as_model, check_time_step, leaf_spec
+from torchrl_l1.control.pipeline import (
+    Settings,
+    as_model,
+    carry,
+    check_time_step,
+    leaf_spec,
+    unspecified,
+    widen_selection,
+)
 from torchrl_l1.control.seal import SEAL, Emitted, sealed
-from torchrl_l1.control.state import L1State, state_names
+from torchrl_l1.control.state import L1Diagnostics, L1State, state_names
 
 
 class _Environment:
@@ -78,10 +87,10 @@ class _Environment:
 
 
 class L1Primer(TensorDictPrimer):
-    """Starts the state of an :class:`L1Controller` at each reset and carries it from step to step.
+    """Starts the state of an :class:`L1Controller` at each reset and carries it on.
 
-    Made by :meth:`L1Controller.make_primer`. It seals each observation and state, for the controller
-    to check, and tells the controller the environment's action bounds and time step.
+    Made by :meth:`L1Controller.make_primer`. It seals each observation and state, for the
+    controller to check, and tells the controller the environment's action bounds and time step.
 
     Raises:
         ValueError: at a reset, if the controller's ``dt`` is not the environment's.
@@ -108,11 +117,19 @@ class L1Primer(TensorDictPrimer):
         self.check_dt = check_dt
         self._state_names = state_names(config)
         self._is_checked = False
+        self._lacking: list[str] | None = None
 
     def empty_cache(self) -> None:
         """Forget what the environment told: a transform may have come or gone."""
         self._is_checked = False
+        self._lacking = None
         super().empty_cache()
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        """Attach to an environment."""
+        super().set_container(container)
+        names = (*self._state_names, SEAL, "u_exec", *L1Diagnostics._fields)
+        widen_selection(self, self.key, names)
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
         """Add the controller's state and signals."""
@@ -130,6 +147,14 @@ class L1Primer(TensorDictPrimer):
         nested = nested.clone(False)
         self._seal(nested, next_tensordict)
         return next_tensordict.set(self.key, nested)
+
+    def _post_step_mdp_hooks(
+        self, tensordict: TensorDictBase, tensordict_: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        if self._lacking is None:
+            self._lacking = unspecified(self, self.key, (*self._state_names, SEAL))
+        carry(self._lacking, "L1Controller's primer", self.key, tensordict, tensordict_)
+        return tensordict, tensordict_
 
     def _without_controller(self, tensordict: TensorDictBase) -> TensorDictBase:
         if tensordict.get((self.key, "u_rl"), None) is not None:
@@ -193,8 +218,8 @@ class L1Controller(TensorDictModuleBase):
         dynamics: the learned model, see :class:`~torchrl_l1.control.ActionJacobian`; an
             ``ActionJacobian`` is used as it is.
         config: the settings; or give ``dt`` and others of :class:`L1Config`'s here. Action bounds
-            that they leave open are those of ``action_spec`` or else, as soon as it is reset, of the
-            environment that a primer is appended to; infinite ones turn clipping off.
+            that they leave open are those of ``action_spec`` or else, as soon as it is reset, of
+            the environment that a primer is appended to; infinite ones turn clipping off.
         dt: time of one environment step in seconds; if ``None``, that of the environment with the
             primer.
         action_spec: of the action that leaves the controller, such as ``env.action_spec``. It may

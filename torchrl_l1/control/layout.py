@@ -243,7 +243,10 @@ def advance(
     if check and seal_is_required and seal is None:
         missing.append(SEAL)
     if missing:
-        raise KeyError(f"{owner} found no {missing} under {key!r}: {remedy}")
+        lost = (
+            "a transform, a module or a collector took it away on the way; keep all that is there"
+        )
+        raise KeyError(f"{owner} found no {missing} under {key!r}: {lost}")
     state = L1State(**entries)
     for name, value, like in (
         (observation_key, observation, state.x_hat),
@@ -252,8 +255,8 @@ def advance(
         if value.shape != like.shape:
             raise ValueError(
                 f"{owner}: {name!r} has shape {tuple(value.shape)}, expected {tuple(like.shape)} "
-                f"as the state under {key!r}; what changes it (a normaliser, a later transform, the "
-                "policy) must have separate out_keys, or L1 another key to read"
+                f"as the state under {key!r}; what changes it (a normaliser, a later transform, "
+                "the policy) must have separate out_keys, or L1 another key to read"
             )
     dtype = state.x_hat.dtype
     if seal is not None:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import EnvBase, PendulumEnv, SerialEnv, TransformedEnv
@@ -16,6 +17,7 @@ from torchrl.envs.transforms import (
     DTypeCastTransform,
     ExcludeTransform,
     FrameSkipTransform,
+    SelectTransform,
     Transform,
 )
 
@@ -111,6 +113,45 @@ def _excluded(transform: Transform, key: str, names: Sequence[str]) -> list[str]
         return []
     excluded = [unravel_key(one) for one in transform.excluded_keys]
     return [name for name in names if key in excluded or (key, name) in excluded]
+
+
+def widen_selection(l1: Transform, key: str, names: Sequence[str]) -> None:
+    """Let ``key`` in a later ``SelectTransform`` stand for all that is in it, leaf by leaf."""
+    chain = chain_of(l1)
+    for later in chain[chain.index(l1) + 1 :]:
+        if isinstance(later, SelectTransform) and key in later.selected_keys:
+            leaves = [(key, name) for name in names]
+            later.selected_keys += [leaf for leaf in leaves if leaf not in later.selected_keys]
+
+
+def unspecified(l1: Transform, key: str, names: Sequence[str]) -> list[str]:
+    """Entries of the state that the environment's specs lack, so that it does not carry them on."""
+    specified = l1.container.full_observation_spec.keys(True, True)
+    return [name for name in names if (key, name) not in specified]
+
+
+def carry(
+    lacking: Sequence[str],
+    owner: str,
+    key: str,
+    tensordict: TensorDictBase,
+    following: TensorDictBase,
+) -> None:
+    """Carry entries that the specs lack from the end of a step to the start of the next.
+
+    ``SelectTransform`` keeps them, since a step reads them, but takes them from the specs.
+
+    Raises:
+        KeyError: naming them, if they are gone.
+    """
+    for name in lacking:
+        value = tensordict.get(("next", key, name), None)
+        if value is None:
+            raise KeyError(
+                f"{owner} found no {lacking} under {('next', key)} after the step: a later "
+                f"transform takes them away; keep {key!r} and all that is in it"
+            )
+        following.set((key, name), value)
 
 
 def time_step(env: EnvBase) -> float | None:

@@ -1,7 +1,7 @@
-"""Whether L1 reads what its environment gave: a seal on the observation and the controller's state.
+"""Whether L1 reads what its environment gave: a seal on observation and controller's state.
 
-A step or reset writes the seal beside the state; the next step computes it anew of what it reads. It
-travels in the tensordict, so that batches, partial resets, processes, collectors and several
+A step or reset writes the seal beside the state; the next step computes it anew of what it reads.
+It travels in the tensordict, so that batches, partial resets, processes, collectors and several
 rollouts at a time need no care.
 """
 
@@ -72,7 +72,7 @@ class Emitted(NamedTuple):
         return cls(observation, state, seal, _versions(observation, state))
 
     def is_what_is_read(self, observation: Tensor, state: L1State, seal: Tensor) -> bool:
-        """Whether these are the very tensors that were emitted, unwritten since: costs no kernel."""
+        """Whether these are the very tensors that were emitted, unwritten since; no kernel."""
         return (
             observation is self.observation
             and seal is self.seal

@@ -17,9 +17,17 @@ from torchrl_l1.control.affine import StepFunction, make_step
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import Predicts
 from torchrl_l1.control.layout import L1_KEY, Dynamics, Layout, advance
-from torchrl_l1.control.pipeline import Settings, as_model, check_order, check_time_step
+from torchrl_l1.control.pipeline import (
+    Settings,
+    as_model,
+    carry,
+    check_order,
+    check_time_step,
+    unspecified,
+    widen_selection,
+)
 from torchrl_l1.control.seal import SEAL, Emitted, sealed
-from torchrl_l1.control.state import L1State, state_names
+from torchrl_l1.control.state import L1Diagnostics, L1State, state_names
 
 
 class L1Transform(Transform):
@@ -122,11 +130,12 @@ class L1Transform(Transform):
         self.diagnostics = diagnostics
         self.dtype = self.model.dtype if dtype is None else dtype
         self._layout: Layout | None = None
-        self._is_ready = False
+        self._is_ready = self._is_stateful = False
         self._step_config: L1Config | None = None
         self._step_function: StepFunction | None = None
         self._emitted: Emitted | None = None
-        self._unspecified: list[str] | None = None
+        self._consumed: Tensor | None = None
+        self._lacking: list[str] | None = None
 
     @property
     def config(self) -> L1Config:
@@ -155,13 +164,13 @@ class L1Transform(Transform):
 
     def _forget(self) -> None:
         self._layout = None
-        self._emitted = None
-        self._unspecified = None
+        self._emitted = self._consumed = None
+        self._lacking = None
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the controller's state and signals."""
         self._check_order()
-        if self.key in observation_spec.keys():
+        if observation_spec.get(self.key, None) is not None:
             raise ValueError(
                 f"the environment has entries under {self.key!r} already, of another controller? "
                 "Give L1Transform a key of its own"
@@ -207,9 +216,24 @@ class L1Transform(Transform):
             check=self.check,
             emitted=self._emitted,
         )
+        if self.check and not torch.compiler.is_compiling():
+            self._check_repeated(tensordict)
         # The caller's tensordict keeps the policy's action: this one is a shallow copy.
         tensordict.set(self.action_key, executed)
         return tensordict.set(self._pending, following)
+
+    def _check_repeated(self, tensordict: TensorDictBase) -> None:
+        """Refuse a second step from one state, as a FrameSkipTransform around takes."""
+        seal, emitted = tensordict.get((self.key, SEAL), None), self._emitted
+        consumed, self._consumed = self._consumed, seal
+        if seal is None or emitted is None or consumed is None or seal is emitted.seal:
+            return
+        again = seal is consumed or (seal.shape == consumed.shape and torch.equal(seal, consumed))
+        if again and self._is_stateful and not torch.equal(seal, emitted.seal):
+            raise ValueError(
+                "L1Transform steps again from a state from which it has stepped: put what repeats "
+                "the action, such as FrameSkipTransform, before it in Compose"
+            )
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         following = tensordict.get(self._pending)
@@ -241,31 +265,17 @@ class L1Transform(Transform):
     def _post_step_mdp_hooks(
         self, tensordict: TensorDictBase, tensordict_: TensorDictBase
     ) -> tuple[TensorDictBase, TensorDictBase]:
-        # SelectTransform keeps the state, which a step reads, but takes it from the specs by which
-        # the state would be carried on.
-        if self._unspecified is None:
-            specified = self.container.full_observation_spec.keys(True, True)
-            names = (*self._state_names, SEAL)
-            self._unspecified = [name for name in names if (self.key, name) not in specified]
-        for name in self._unspecified:
-            value = tensordict.get(("next", self.key, name), None)
-            if value is None:
-                raise KeyError(
-                    f"L1Transform found no {self._unspecified} under {('next', self.key)} after "
-                    f"the step: a later transform takes them away; keep {self.key!r} and all that "
-                    "is in it"
-                )
-            tensordict_.set((self.key, name), value)
+        if self._lacking is None:
+            self._lacking = unspecified(self, self.key, (*self._state_names, SEAL))
+        carry(self._lacking, "L1Transform", self.key, tensordict, tensordict_)
         return tensordict, tensordict_
 
     def _check_batched_worker_compat(self) -> None:
-        specified = self.container.full_observation_spec.keys(True, True)
-        names = (*self._state_names, SEAL)
-        lost = [(self.key, name) for name in names if (self.key, name) not in specified]
-        if lost:
+        lacking = unspecified(self, self.key, (*self._state_names, SEAL))
+        if lacking:
             raise ValueError(
-                f"a batched environment loses {lost} of L1Transform, which a later transform takes "
-                "from the specs: name them all in SelectTransform"
+                f"a batched environment would lose {lacking} of L1Transform, which a later "
+                f"transform takes from the specs: add {self.key!r} to its SelectTransform"
             )
 
     def _fresh(self, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -290,6 +300,8 @@ class L1Transform(Transform):
             dimensions = layout.observation_dim, layout.action_dim
             layout.bounded(self._settings.config).check_dimensions(*dimensions)
             self.model.check_dimensions(*dimensions)
+            # An environment with its state in the tensordict may step from any state, also twice.
+            self._is_stateful = not list(parent.base_env.full_state_spec.keys(True, True))
             self._layout, self._is_ready = layout, False
         return self._layout
 
@@ -310,6 +322,7 @@ class L1Transform(Transform):
     def _check_order(self) -> None:
         names = (*self._state_names, SEAL)
         check_order(self, self.observation_key, self.action_key, self.key, names)
+        widen_selection(self, self.key, (*names, "u_exec", *L1Diagnostics._fields))
 
     def _is_in_environment(self) -> bool:
         try:
@@ -333,5 +346,11 @@ class L1Transform(Transform):
 
     def __getstate__(self) -> dict[str, Any]:
         # Compiled functions do not travel between processes.
-        empty = {"_step_function": None, "_layout": None, "_emitted": None, "_unspecified": None}
+        empty = {
+            "_step_function": None,
+            "_layout": None,
+            "_emitted": None,
+            "_consumed": None,
+            "_lacking": None,
+        }
         return super().__getstate__() | empty
