@@ -284,10 +284,11 @@ class Settings:
 
     def bound(self, low: Scalars | None, high: Scalars | None) -> None:
         """Fill action bounds that are open."""
-        for name, value in (("action_low", low), ("action_high", high)):
-            if getattr(self.config, name) is None:
-                self._others[name] = value
-                self.config = replace(self.config, **{name: value})
+        config = self.config
+        low = low if config.action_low is None else config.action_low
+        high = high if config.action_high is None else config.action_high
+        self.config = replace(config, action_low=low, action_high=high)
+        self._others |= {"action_low": low, "action_high": high}
 
     @property
     def missing(self) -> str:
