@@ -21,7 +21,7 @@ from torchrl_l1.campaign.plan import check_devices, plan
 from torchrl_l1.campaign.progress import overview
 from torchrl_l1.campaign.reuse import copy_run, find_reusable
 from torchrl_l1.campaign.workers import Stopped, available_cores
-from torchrl_l1.experiment.run_directory import locked, write_atomically
+from torchrl_l1.experiment.files import locked, write_atomically
 
 
 def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> None:

@@ -83,8 +83,8 @@ class PlannedRun:
         return min(self.directory.iterations_done(), self.iterations)
 
     def finished(self) -> bool:
-        """Whether all outer iterations are done."""
-        return self.iterations_done() >= self.iterations
+        """Whether all outer iterations are done, and their files are as they were written."""
+        return self.iterations_done() >= self.iterations and self.directory.intact()
 
     def settings(self) -> dict[str, Any]:
         """The configuration as plain dictionaries, lists and values."""
@@ -110,7 +110,10 @@ class PlannedRun:
     def problem(self) -> str | None:
         """What keeps the run from being finished as planned; ``None`` if it is."""
         if not self.finished():
-            return f"{self} has {self.iterations_done()} of {self.iterations} iterations"
+            done = self.iterations_done()
+            if done >= self.iterations:
+                return f"{self} has files that are not as they were written"
+            return f"{self} has {done} of {self.iterations} iterations"
         try:
             self.check_directory()
         except RunDirectoryError as error:

@@ -13,12 +13,12 @@ from omegaconf import OmegaConf
 from torchrl_l1.campaign.description import CampaignError
 from torchrl_l1.campaign.plan import PlannedRun
 from torchrl_l1.experiment.evaluate import episodes_file
+from torchrl_l1.experiment.files import write_atomically
 from torchrl_l1.experiment.run_directory import (
     RunDirectory,
     differences,
     read_config,
     run_directories,
-    write_atomically,
 )
 
 
@@ -94,7 +94,7 @@ def _key(config: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def _finished(directory: RunDirectory, config: Mapping[str, Any]) -> bool:
-    return directory.iterations_done() == config.get("outer_iterations")
+    return directory.iterations_done() == config.get("outer_iterations") and directory.intact()
 
 
 def _keep_evaluations(source: Path, copy: Path, wanted: Set[str]) -> None:

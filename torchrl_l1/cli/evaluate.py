@@ -26,6 +26,7 @@ from torchrl_l1.experiment.evaluate import (
     load_run,
     make_collection,
 )
+from torchrl_l1.experiment.files import write_table
 from torchrl_l1.experiment.l1_options import check_tested
 from torchrl_l1.experiment.matrix import (
     SUITE_L1,
@@ -37,7 +38,6 @@ from torchrl_l1.experiment.matrix import (
     conditions,
 )
 from torchrl_l1.experiment.recipes import group_setting
-from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.experiment.settings import RunSettings, WandbSettings
 from torchrl_l1.report.evaluation_figures import RANGES, plot_disturbances
 from torchrl_l1.report.evaluation_summary import summarize, summary_tables

@@ -16,7 +16,8 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_l1.algorithms import Algorithm
-from torchrl_l1.experiment.run_directory import RunDirectory, save_atomically, versions, write_table
+from torchrl_l1.experiment.checkpoints import checkpoint_of, load_state
+from torchrl_l1.experiment.run_directory import RunDirectory, versions
 from torchrl_l1.experiment.settings import RunSettings
 
 MODES = ("auto", "online", "offline", "disabled")
@@ -125,14 +126,18 @@ def _run(
 ) -> None:
     rows: list[dict[str, Any]] = []
     timings: list[dict[str, Any]] = []
-    checkpoint = directory.load_checkpoint()
+    checkpoint = directory.load_checkpoint(settings, progress.write)
     if checkpoint is not None:
-        algorithm.load_state_dict(checkpoint["algorithm"])
+        load_state(algorithm, checkpoint["algorithm"], directory.checkpoint_file)
         rows, timings = checkpoint["metrics"], checkpoint["timings"]
         progress.update(len(rows))
-        if directory.iterations_done() < len(rows):
-            # A kill has come between the checkpoint and the files made from it.
-            _write_results(algorithm, directory, rows, timings)
+        if directory.last_is_good:
+            # A kill has come between the checkpoint and the files made from it, or they changed.
+            restored = directory.restore_results(algorithm.weights(), rows, timings)
+            if restored:
+                progress.write(
+                    f"{directory.path}: written from the checkpoint: {', '.join(restored)}"
+                )
         if len(rows) >= recipe.outer_iterations:
             progress.write(f"{directory.path} is complete: nothing to do")
             return
@@ -154,9 +159,9 @@ def _run(
             rows.append(result.metrics)
             timings.append({"iteration": result.metrics["iteration"], **result.seconds})
             directory.save_checkpoint(
-                {"algorithm": algorithm.state_dict(), "metrics": rows, "timings": timings}
+                checkpoint_of(algorithm.state_dict(), rows, timings, settings)
             )
-            _write_results(algorithm, directory, rows, timings)
+            directory.write_results(algorithm.weights(), rows, timings)
             tracker.log(rows[-1], timings[-1])
             progress.update()
             progress.write(
@@ -164,16 +169,3 @@ def _run(
                 f"return {result.metrics['return_mean']:.2f} "
                 f"(deterministic {result.metrics['return_deterministic']:.2f})"
             )
-
-
-def _write_results(
-    algorithm: Algorithm,
-    directory: RunDirectory,
-    rows: list[dict[str, Any]],
-    timings: list[dict[str, Any]],
-) -> None:
-    for name, state in algorithm.weights().items():
-        save_atomically(directory.path / f"{name}.pt", state)
-    write_table(directory.timing_file, timings)
-    # Last: whoever finds the last row takes the run for finished and never comes back to it.
-    write_table(directory.metrics_file, rows)

@@ -27,6 +27,7 @@ from torchrl_l1.checks import check_choice, check_count, check_optional_count
 from torchrl_l1.compilation import check_mode
 from torchrl_l1.control import L1Config
 from torchrl_l1.envs import get_task
+from torchrl_l1.experiment.files import bounded_overrides
 
 
 @dataclass
@@ -100,7 +101,7 @@ class RunSettings(ABC):
         recipe: the recipe's name, as given on the command line.
         task: a task of :data:`torchrl_l1.envs.TASKS`.
         seed: seed of every random stream.
-        run_dir: where the run's files go.
+        run_dir: where the run's files go; a long list of overrides is shortened in its name.
         resume: continue the run in ``run_dir`` from its last checkpoint.
         threads: CPU threads of torch.
         device: ``cpu``, ``cuda`` or ``auto`` (CUDA where there is one).
@@ -115,7 +116,7 @@ class RunSettings(ABC):
     recipe: str = MISSING
     task: str = MISSING
     seed: int = 0
-    run_dir: str = "runs/${recipe}/${hydra:job.override_dirname}/seed_${seed}"
+    run_dir: str = "runs/${recipe}/${bounded:${hydra:job.override_dirname}}/seed_${seed}"
     resume: bool = False
     threads: int = 1
     device: str = "cpu"
@@ -172,6 +173,9 @@ class RunSettings(ABC):
             compile_l1=check_mode(self.l1.compile, "l1.compile"),
         )
 
+
+# Not in ``register``: launchers resolve it in processes of their own.
+OmegaConf.register_new_resolver("bounded", bounded_overrides, replace=True)
 
 # Keys that may differ between a run and its continuation: they do not touch the result.
 VOLATILE_KEYS = ("run_dir", "resume", "wandb")
