@@ -17,8 +17,9 @@ from tqdm import tqdm
 
 from torchrl_l1.algorithms import Algorithm
 from torchrl_l1.experiment.checkpoints import checkpoint_of, load_state
+from torchrl_l1.experiment.files import refuse_link
 from torchrl_l1.experiment.run_directory import RunDirectory, versions
-from torchrl_l1.experiment.settings import RunSettings
+from torchrl_l1.experiment.settings import RunSettings, check_known
 
 MODES = ("auto", "online", "offline", "disabled")
 
@@ -93,6 +94,7 @@ def run(config: DictConfig) -> Path:
         RunDirectoryError: if the run directory holds another run.
         ValueError: if settings contradict each other; nothing has been written then.
     """
+    check_known(config)
     resolved = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(resolved, dict)
     recipe = OmegaConf.to_object(config)
@@ -111,6 +113,7 @@ def run(config: DictConfig) -> Path:
         algorithm = recipe.build()
         algorithm.on_phase = lambda phase: progress.set_postfix_str(phase)
         directory = RunDirectory(recipe.run_dir)
+        refuse_link(directory.path / "wandb")
         with directory.open(settings, recipe.resume):
             _run(algorithm, recipe, settings, directory, progress)
     print(f"Finished: {directory.metrics_file}")
@@ -135,9 +138,8 @@ def _run(
             # A kill has come between the checkpoint and the files made from it, or they changed.
             restored = directory.restore_results(algorithm.weights(), rows, timings)
             if restored:
-                progress.write(
-                    f"{directory.path}: written from the checkpoint: {', '.join(restored)}"
-                )
+                names = ", ".join(restored)
+                progress.write(f"{directory.path}: written again from the checkpoint: {names}")
         if len(rows) >= recipe.outer_iterations:
             progress.write(f"{directory.path} is complete: nothing to do")
             return

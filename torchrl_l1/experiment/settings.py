@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, is_dataclass
+from difflib import get_close_matches
 from functools import cache
 from typing import Any, ClassVar
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 
 from torchrl_l1.algorithms import (
     MBMF,
@@ -194,6 +195,40 @@ def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
     for key, value in node.items():
         flat.update(flatten(value, f"{prefix}.{key}" if prefix else str(key)))
     return flat
+
+
+def check_known(config: DictConfig) -> None:
+    """Make sure that a composed recipe has a schema and no key that this does not know.
+
+    Hydra lets ``+key=value`` add one, which nobody would read.
+
+    Raises:
+        ValueError: naming the key.
+    """
+    kind = OmegaConf.get_type(config)
+    if not (isinstance(kind, type) and issubclass(kind, RunSettings)):
+        raise ValueError(
+            "the recipe has no schema; put that of its algorithm, such as metrpo_recipe, first in "
+            "its defaults"
+        )
+    known: list[str] = []
+    for key in _unknown(config, "", known):
+        close = get_close_matches(key, known, n=1)
+        hint = f"; did you mean {close[0]}?" if close else ""
+        raise ValueError(f"there is no key {key!r}, and + adds none{hint}")
+
+
+def _unknown(node: DictConfig, prefix: str, known: list[str]) -> list[str]:
+    kind = OmegaConf.get_type(node)
+    named = {part.name for part in fields(kind)} if is_dataclass(kind) else None
+    found = []
+    known += [prefix + name for name in named or ()]
+    for key in node:
+        if named is not None and key not in named and not (key == "hydra" and not prefix):
+            found.append(f"{prefix}{key}")
+        elif isinstance(part := node._get_node(key), DictConfig) and key != "hydra":
+            found += _unknown(part, f"{prefix}{key}.", known)
+    return found
 
 
 def l1_config(settings: L1Settings, task_name: str) -> L1Config | None:
