@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from torchrl_l1.algorithms import METRPO
+from torchrl_l1.experiment.files import write_table
 from torchrl_l1.experiment.matrix import disturbance_words
-from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.report.evaluation_summary import summarize, summary_lines
 from torchrl_l1.report.page import markdown
 from torchrl_l1.report.recovery import MEDIANS, plot_heat_map

@@ -27,8 +27,9 @@ from torchrl_l1.campaign.progress import overview
 from torchrl_l1.campaign.workers import TEMPORARY_FAILURE
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.errors import RunDirectoryError
+from torchrl_l1.experiment.files import locked
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.run_directory import RunDirectory, locked
+from torchrl_l1.experiment.run_directory import RunDirectory
 
 PENDULUM = "metrpo/inverted_pendulum"
 

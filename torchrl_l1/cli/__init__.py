@@ -9,6 +9,8 @@ from collections.abc import Sequence
 
 DESCRIPTION = "Robust model-based reinforcement learning with L1 adaptive control."
 
+_TRUST = "let the file set up Hydra itself, which may run any code"
+
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the console script. Exits with status 1 on a refused request."""
@@ -61,7 +63,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
         print(f"torchrl-l1 {options.command}: {message(error)}", file=sys.stderr)
-        print("(HYDRA_FULL_ERROR=1 shows where it was raised)", file=sys.stderr)
+        if isinstance(error, BrokenPipeError):
+            # Nothing more can be written there, not even when the interpreter ends.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
 
 
@@ -74,6 +78,7 @@ def _run_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     )
     run.add_argument("recipe", help="such as metrpo/inverted_pendulum, or a YAML file of yours")
     run.add_argument("--resume", action="store_true", help="continue from the last checkpoint")
+    run.add_argument("--trust", action="store_true", help=_TRUST)
 
 
 def _campaign_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -99,6 +104,7 @@ def _campaign_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
         metavar="DIR",
         help="copy finished runs with the same settings from these folders or below them",
     )
+    add("--trust", action="store_true", help=_TRUST)
     add("--launcher", help="hand the runs to one of Hydra's launchers, such as joblib")
 
 
@@ -135,4 +141,5 @@ def _report_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]
 def _run(options: argparse.Namespace, overrides: list[str]) -> None:
     from torchrl_l1.experiment.launch import launch
 
-    launch(options.recipe, overrides + (["resume=true"] if options.resume else []))
+    flags = ["--trust"] if options.trust else []
+    launch(options.recipe, overrides + flags + (["resume=true"] if options.resume else []))

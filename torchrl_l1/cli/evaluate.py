@@ -26,6 +26,7 @@ from torchrl_l1.experiment.evaluate import (
     load_run,
     make_collection,
 )
+from torchrl_l1.experiment.files import refuse_link, write_table
 from torchrl_l1.experiment.l1_options import check_tested
 from torchrl_l1.experiment.matrix import (
     SUITE_L1,
@@ -37,7 +38,6 @@ from torchrl_l1.experiment.matrix import (
     conditions,
 )
 from torchrl_l1.experiment.recipes import group_setting
-from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.experiment.settings import RunSettings, WandbSettings
 from torchrl_l1.report.evaluation_figures import RANGES, plot_disturbances
 from torchrl_l1.report.evaluation_summary import summarize, summary_tables
@@ -211,6 +211,9 @@ def evaluate_command(options: argparse.Namespace) -> None:
     values["stage"] = _stages(runs, options.stage)
     cells = distinct(runs[0], conditions(options.suite, **values))
     output = Path(options.output) if options.output else runs[0].path / "evaluation"
+    if not options.output:
+        refuse_link(output)
+    output.mkdir(parents=True, exist_ok=True)
     rows, episodes = [], []
     total = len(runs) * len(cells)
     with tqdm(total=total, desc="evaluate", unit="cell", disable=None) as progress:
@@ -220,7 +223,6 @@ def evaluate_command(options: argparse.Namespace) -> None:
                 episodes += single
                 progress.update()
 
-    output.mkdir(parents=True, exist_ok=True)
     summary = summarize(rows, episodes)
     print(f"\n{runs[0].recipe.task}: {summary_tables(summary)}\n")
     tables = {"evaluation": rows, "episodes": episodes, "summary": summary}

@@ -16,8 +16,10 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_l1.algorithms import Algorithm
-from torchrl_l1.experiment.run_directory import RunDirectory, save_atomically, versions, write_table
-from torchrl_l1.experiment.settings import RunSettings
+from torchrl_l1.experiment.checkpoints import checkpoint_of, load_state
+from torchrl_l1.experiment.files import refuse_link
+from torchrl_l1.experiment.run_directory import RunDirectory, versions
+from torchrl_l1.experiment.settings import RunSettings, check_known
 
 MODES = ("auto", "online", "offline", "disabled")
 
@@ -92,6 +94,7 @@ def run(config: DictConfig) -> Path:
         RunDirectoryError: if the run directory holds another run.
         ValueError: if settings contradict each other; nothing has been written then.
     """
+    check_known(config)
     resolved = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(resolved, dict)
     recipe = OmegaConf.to_object(config)
@@ -110,6 +113,7 @@ def run(config: DictConfig) -> Path:
         algorithm = recipe.build()
         algorithm.on_phase = lambda phase: progress.set_postfix_str(phase)
         directory = RunDirectory(recipe.run_dir)
+        refuse_link(directory.path / "wandb")
         with directory.open(settings, recipe.resume):
             _run(algorithm, recipe, settings, directory, progress)
     print(f"Finished: {directory.metrics_file}")
@@ -125,14 +129,17 @@ def _run(
 ) -> None:
     rows: list[dict[str, Any]] = []
     timings: list[dict[str, Any]] = []
-    checkpoint = directory.load_checkpoint()
+    checkpoint = directory.load_checkpoint(settings, progress.write)
     if checkpoint is not None:
-        algorithm.load_state_dict(checkpoint["algorithm"])
+        load_state(algorithm, checkpoint["algorithm"], directory.checkpoint_file)
         rows, timings = checkpoint["metrics"], checkpoint["timings"]
         progress.update(len(rows))
-        if directory.iterations_done() < len(rows):
-            # A kill has come between the checkpoint and the files made from it.
-            _write_results(algorithm, directory, rows, timings)
+        if directory.last_is_good:
+            # A kill has come between the checkpoint and the files made from it, or they changed.
+            restored = directory.restore_results(algorithm.weights(), rows, timings)
+            if restored:
+                names = ", ".join(restored)
+                progress.write(f"{directory.path}: written again from the checkpoint: {names}")
         if len(rows) >= recipe.outer_iterations:
             progress.write(f"{directory.path} is complete: nothing to do")
             return
@@ -154,9 +161,9 @@ def _run(
             rows.append(result.metrics)
             timings.append({"iteration": result.metrics["iteration"], **result.seconds})
             directory.save_checkpoint(
-                {"algorithm": algorithm.state_dict(), "metrics": rows, "timings": timings}
+                checkpoint_of(algorithm.state_dict(), rows, timings, settings)
             )
-            _write_results(algorithm, directory, rows, timings)
+            directory.write_results(algorithm.weights(), rows, timings)
             tracker.log(rows[-1], timings[-1])
             progress.update()
             progress.write(
@@ -164,16 +171,3 @@ def _run(
                 f"return {result.metrics['return_mean']:.2f} "
                 f"(deterministic {result.metrics['return_deterministic']:.2f})"
             )
-
-
-def _write_results(
-    algorithm: Algorithm,
-    directory: RunDirectory,
-    rows: list[dict[str, Any]],
-    timings: list[dict[str, Any]],
-) -> None:
-    for name, state in algorithm.weights().items():
-        save_atomically(directory.path / f"{name}.pt", state)
-    write_table(directory.timing_file, timings)
-    # Last: whoever finds the last row takes the run for finished and never comes back to it.
-    write_table(directory.metrics_file, rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -12,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from torchrl_l1.algorithms.facts import MEASURING, WINDOW
-from torchrl_l1.experiment.errors import RunDirectoryError
+from torchrl_l1.experiment.errors import RunDirectoryError, message
 from torchrl_l1.experiment.run_directory import RunDirectory, run_directories
 from torchrl_l1.report.identity import Identity, facts, identify
 from torchrl_l1.report.reading import (
@@ -199,12 +200,22 @@ def find_readable_runs(folders: Sequence[Path]) -> Findings:
     return found
 
 
+def _read_table(file: Path) -> list[Evaluation]:
+    """An evaluation whose name is a word, as campaigns ask for: it goes into names and headings."""
+    if not re.fullmatch(r"[A-Za-z0-9_.+-]{1,100}", file.stem):
+        raise RunDirectoryError(f"cannot use {file}: its name is no word of at most 100 letters")
+    return read_evaluations(file)
+
+
 def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirectoryError]) -> Run:
     try:
         identity = identify(config)
         algorithm = facts(identity.algorithm)
-    except (KeyError, TypeError, ValueError) as error:
-        raise RunDirectoryError(f"cannot use {directory.config_file}: {error}") from error
+    # A damaged configuration may hold anything anywhere.
+    except Exception as error:
+        raise RunDirectoryError(f"cannot use {directory.config_file}: {message(error)}") from error
+    if problem := directory.metrics_problem():
+        raise RunDirectoryError(problem)
     columns = read_metrics(directory.metrics_file, len(algorithm.named_stages))
     iterations = len(columns["iteration"])
     if iterations > identity.outer_iterations:
@@ -223,7 +234,7 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
     path = directory.path
     tables = sorted((path / "evaluations").glob("*.csv"))
     evaluations: dict[str, list[Evaluation]] = {
-        file.stem: readable(partial(read_evaluations, file), []) for file in tables
+        file.stem: readable(partial(_read_table, file), []) for file in tables
     }
     return Run(
         path,
