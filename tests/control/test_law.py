@@ -233,7 +233,7 @@ def test_the_estimate_is_bounded_by_the_disturbance():
 def test_projection_bounds_the_filter_where_actions_have_almost_no_effect(filter_input):
     def largest(**settings) -> tuple[float, L1State, torch.Tensor]:
         config = L1Config(0.05, filter_input=filter_input, **settings)
-        jac = torch.full((1, 1, 1), 1e-12, dtype=torch.float64)
+        jac = torch.full((1, 1, 1), 1e-6, dtype=torch.float64)
         state = init([1], 1, 1, dtype=torch.float64)
         zero, x = torch.zeros(1, 1, dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
         most = 0.0
@@ -248,12 +248,12 @@ def test_projection_bounds_the_filter_where_actions_have_almost_no_effect(filter
     projected, state, rates = largest(**bounds)
     assert 2.9 < projected <= 3.0
     free, free_state, free_rates = largest(**bounds, project=False)
-    assert free > 1e6
+    assert free > 5e4
     # Predictor and diagnostics take in the whole estimate either way.
     torch.testing.assert_close(state.x_hat, free_state.x_hat)
     torch.testing.assert_close(rates, free_rates)
     for open_bounds in ({}, {"action_low": -1.0}, {"action_low": -1.0, "action_high": np.inf}):
-        assert largest(**open_bounds)[0] > 1e6
+        assert largest(**open_bounds)[0] > 5e4
     assert largest(action_low=(-1.0,), action_high=(2.0,))[0] == projected
 
 

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from torchrl_l1.compilation import CompileMode, compiled
-from torchrl_l1.control import law
+from torchrl_l1.control import kalman_law, law
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import ActionJacobian
+from torchrl_l1.control.signals import diagnose, saturate
 from torchrl_l1.control.state import L1Diagnostics, L1State
 
 BLOCK = 128
@@ -185,13 +186,15 @@ def augment_silently(
     """:func:`augment` with the diagnostics as a function, which need not be called."""
     if config.filter == "kalman":
         return _augment_kalman(config, model, state, observation, u_rl)
-    u_rl = law.saturate(config, u_rl)
+    u_rl = saturate(config, u_rl)
     u_bar = torch.where(state.started, state.u_bar, u_rl)
     tested = _tested_input(config, model, state, observation, u_rl, u_bar)
     switch, error, affinization = operating_point(
         model, observation, u_bar, u_rl, tested, state.started, config.epsilon
     )
     u_bar, change, jacobian = affinization
+    # A prediction that is not finite at the tested input counts like one at the operating point.
+    change = torch.where(state.started & ~error.isfinite(), torch.nan, change)
     restart = switch if config.on_switch == "reset" else None
     residuals = None
     if config.estimator == "weighted":
@@ -205,7 +208,7 @@ def augment_silently(
 
     def diagnostics() -> L1Diagnostics:
         counted = error.masked_fill(terms.non_finite | ~state.started, 0.0)
-        return law.diagnose(config, terms, switch, counted)
+        return diagnose(config, terms, switch, counted)
 
     return u, following, diagnostics
 
@@ -218,22 +221,22 @@ def _augment_kalman(
     u_rl: Tensor,
 ) -> tuple[Tensor, L1State, Callable[[], L1Diagnostics]]:
     """As :func:`augment_silently`: here the input is known before the model is expanded, at it."""
-    u_rl = law.saturate(config, u_rl)
+    u_rl = saturate(config, u_rl)
     # What the last step expected does not depend on where this one is.
     known = model.residual_statistics(observation, u_rl, "residuals")
-    estimated = law.estimate(config, state, observation, known)
-    u = law.adapted(config, estimated, u_rl)
+    estimated = kalman_law.estimate(config, state, observation, known)
+    u = kalman_law.adapted(config, estimated, u_rl)
     u_bar, change, jacobian = affinize(model, observation, u)
     residuals = known
     if config.covariance != "residuals":
         residuals = model.residual_statistics(observation, u, config.covariance)
-    u, following, terms = law.follow(
+    u, following, terms = kalman_law.follow(
         config, state, estimated, observation, u_rl, change, jacobian, u_bar, residuals
     )
     following = following._replace(
         u_bar=u_bar.masked_fill(terms.non_finite, 0.0), n_switch=state.n_switch + state.started
     )
-    return u, following, partial(law.diagnose, config, terms, state.started)
+    return u, following, partial(diagnose, config, terms, state.started)
 
 
 def _tested_input(
@@ -252,7 +255,7 @@ def _tested_input(
         change, jacobian = model.value_and_jacobian(observation, u_bar)
         return law.respond(config, state, observation, u_rl, change, jacobian, u_bar)[0]
     # It does not depend on the operating point: the filter's next state is known.
-    adapted = law.saturate(config, u_rl - law.filtered(config, state.q, state.sigma_m))
+    adapted = saturate(config, u_rl - law.filtered(config, state.q, state.sigma_m))
     return torch.where(state.started, adapted, u_rl)
 
 

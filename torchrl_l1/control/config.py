@@ -90,6 +90,8 @@ class L1Config:
             ``process_noise``.
         forgetting: factor per step of the running estimate of how noisy each state is, which
             notices a sensor that has become noisy; 1 does without.
+        max_error: largest entry of the prediction error that is believed, raw state units, or
+            infinity. Beyond it an observation counts as not finite: L1 stands aside and restarts.
 
     Raises:
         ValueError: for a setting out of its domain, or settings that exclude each other.
@@ -123,6 +125,7 @@ class L1Config:
     inflation: float | None = None
     initial_deviation: float = 0.3
     forgetting: float = 0.97
+    max_error: float = 1e8
 
     def __post_init__(self) -> None:
         # What NumPy and torch call a number, an array or a truth value becomes Python's.
@@ -132,8 +135,8 @@ class L1Config:
             object.__setattr__(self, name, value)
             if value is not None and not (_is_real(value) and math.isfinite(value)):
                 raise ValueError(f"{name} must be a finite number, got {value!r}")
-        if self.dt <= 0:
-            raise ValueError(f"dt must be a positive time in seconds, got {self.dt}")
+        if self.dt < 1e-15:
+            raise ValueError(f"dt must be a positive time in seconds, from 1e-15, got {self.dt}")
         if self.epsilon < 0:
             raise ValueError(f"epsilon must not be negative, got {self.epsilon}")
         for name, choices in _CHOICES.items():
@@ -144,6 +147,8 @@ class L1Config:
             raise ValueError(f"project must be True or False, got {self.project!r}")
         self._check_filter()
         self._check_kalman()
+        if not (_is_real(self.max_error) and self.max_error > 0):
+            raise ValueError(f"max_error must be a positive number, got {self.max_error!r}")
         self._check_predictor()
         self._check_bounds()
 
@@ -164,6 +169,9 @@ class L1Config:
             raise ValueError(f"process_noise must not be negative, got {self.process_noise}")
         if self.inflation is not None and self.inflation <= 0:
             raise ValueError(f"inflation must be positive, got {self.inflation}")
+        for name in ("dead_zone", "process_noise", "inflation", "initial_deviation"):
+            if (getattr(self, name) or 0) > 1e9:  # their squares and products must not overflow
+                raise ValueError(f"{name} must not exceed 1e9, got {getattr(self, name)}")
         if self.initial_deviation <= 0:
             raise ValueError(f"initial_deviation must be positive, got {self.initial_deviation}")
         if not 0 < self.forgetting <= 1:
@@ -298,7 +306,10 @@ class L1Config:
 
 def _adaptation_gain(rate: float, dt: float) -> float:
     # expm1 because exp(z) - 1 loses half the digits at the small z of a fast controller.
-    return -rate * dt / math.expm1(-rate * dt)
+    z = -rate * dt
+    if not 0 < z < 700:  # the limits, where the quotient has none
+        return 1.0 if z == 0 else 0.0
+    return z / math.expm1(z)
 
 
 def _is_real(value: object) -> bool:

@@ -135,6 +135,7 @@ def significant(posterior: Posterior, dead_zone: float) -> Tensor:
 def summary(posterior: Posterior) -> tuple[Tensor, Tensor]:
     """Norm of the standard deviations, and the mean's largest entry in them, each ``(..., 1)``."""
     deviation = posterior.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-    relative = posterior.mean.abs() / deviation.clamp_min(torch.finfo(deviation.dtype).tiny)
+    limits = torch.finfo(deviation.dtype)
+    relative = (posterior.mean.abs() / deviation.clamp_min(limits.tiny)).clamp_max(limits.max)
     norm = torch.linalg.vector_norm(deviation, dim=-1, keepdim=True)
     return norm, relative.amax(-1, keepdim=True)

@@ -20,6 +20,19 @@ It bounds the gain along a nearly dependent direction to 16 per unit column and 
 remaining directions by about 0.1 percent.
 """
 
+EFFECT_TOLERANCE = {torch.float32: 1e-7, torch.float64: 1e-8}
+"""Smallest effect of an action that can be told from none, relative to the state, by dtype.
+
+In single precision a smaller one vanishes in the rounding of the observation; no learned model is
+so exact that it could tell the effect from its own error.
+"""
+
+_SMALLEST_STATE = 1e-3
+"""A state counts as no smaller than this in :func:`without_effect`, raw units.
+
+At rest in the origin any effect is infinite in relation to it.
+"""
+
 _SMALLEST_RELATIVE_COLUMN = 1e-3
 """Columns are scaled to unit length, but by no more than this times the longest column.
 
@@ -50,11 +63,37 @@ def solve_matched(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
         >>> solution, flagged
         (tensor([3., 2.]), tensor([False]))
     """
+    dtype = jacobian.dtype
+    if dtype not in EFFECT_TOLERANCE:  # the products of half-precision columns overflow
+        solution, ill_conditioned = solve_matched(jacobian.float(), residual.float())
+        return solution.to(dtype), ill_conditioned
     if jacobian.shape[-1] == 1:
         solution, ill_conditioned = _solve_one_column(jacobian, residual)
         return torch.where(solution.isfinite(), solution, 0.0), ill_conditioned
     solution, ill_conditioned = _solve_columns(jacobian, residual)
     return solution.masked_fill(~is_finite(solution), 0.0), ill_conditioned
+
+
+def without_effect(jacobian: Tensor, size: Tensor, reach: Tensor | float) -> Tensor:
+    r"""Which actions have no effect that could be seen, whatever they do: ``(..., m)``, bool.
+
+    Those for which :math:`|J_{ij}|\, h_j < \tau \max(|x_i|, 10^{-3})` in every state :math:`i`,
+    with :math:`h` half the range of the actions and :math:`\tau` of :data:`EFFECT_TOLERANCE`.
+    Least squares would give them estimates without bound.
+
+    Args:
+        jacobian: ``(..., n, m)``, state units per step and action unit.
+        size: magnitudes of the state ``(..., n)``.
+        reach: half the range of each action ``(m,)``, or a number.
+
+    Examples:
+        >>> jacobian = torch.tensor([[1.0, 1e-12], [0.0, 1e-12]])
+        >>> without_effect(jacobian, torch.ones(2), 1.0)
+        tensor([False,  True])
+    """
+    relative = jacobian / size.clamp_min(_SMALLEST_STATE).unsqueeze(-1)
+    effect = torch.linalg.vector_norm(relative, torch.inf, -2)
+    return effect < EFFECT_TOLERANCE[jacobian.dtype] / reach
 
 
 def _solve_one_column(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:

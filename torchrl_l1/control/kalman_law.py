@@ -1,0 +1,243 @@
+"""The robust law as pure functions: a matched disturbance tracked by a Kalman filter."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrl_l1.control import kalman
+from torchrl_l1.control.config import L1Config, Scalars
+from torchrl_l1.control.kalman import Posterior
+from torchrl_l1.control.least_squares import is_finite, whitened, without_effect
+from torchrl_l1.control.signals import (
+    Terms,
+    credible,
+    like,
+    narrow,
+    narrow_entries,
+    project,
+    saturate,
+    wide,
+    wide_state,
+)
+from torchrl_l1.control.state import L1State, ResidualStatistics
+
+
+class Estimate(NamedTuple):
+    """What the Kalman filter knows before it says what to do.
+
+    Attributes:
+        posterior: of the matched disturbance; zero where it is not finite.
+        noise: running ratios of the residuals' squares to those expected ``(..., n)``.
+        innovation: what the prediction missed ``(..., n)``, state units.
+        residual: what the model missed ``(..., n)``: the innovation and what was expected of
+            the disturbance.
+        effect_matched: what of it the posterior explains ``(..., n)``.
+        finite: whether all of this is finite ``(..., 1)``, bool.
+    """
+
+    posterior: Posterior
+    noise: Tensor
+    innovation: Tensor
+    residual: Tensor
+    effect_matched: Tensor
+    finite: Tensor
+
+
+def estimate(
+    config: L1Config,
+    state: L1State,
+    observation: Tensor,
+    residuals: ResidualStatistics | None = None,
+    restart: Tensor | None = None,
+) -> Estimate:
+    r"""What the observation tells of the matched disturbance: one step of a Kalman filter.
+
+    The disturbance :math:`d` is a random walk, seen through the last step's Jacobian in the
+    model's residual:
+
+    .. math::
+
+        d_t = d_{t-1} + \nu_t, \quad \nu_t \sim N(0, q^2 I), \qquad
+        x_t - x_{t-1} - \hat f(x_{t-1}, u_{t-1}) = J_{t-1} d_t + w_t, \quad
+        w_t \sim N(0, D_t \Lambda D_t)
+
+    with :math:`\Lambda` the inflated covariance of the residuals. The squares of the diagonal
+    :math:`D_t` are a running mean of :func:`~.kalman.noise_ratio`, none below one, times their
+    mean over the states: a state whose sensor has become noisy loses its weight, and all do where
+    many have. A single residual beyond expectation loses it at once, see
+    :func:`~.kalman.doubt`.
+
+    Args:
+        config: the settings.
+        state: from :func:`~torchrl_l1.control.init` with these settings, or the previous step.
+        observation: ``(..., n)``, raw units.
+        residuals: as in :func:`step`.
+        restart: as in :func:`step`.
+
+    Returns:
+        the posterior and what led to it.
+    """
+    state, observation = wide_state(state), wide(observation)
+    assert state.covariance is not None and state.noise is not None and state.jacobian is not None
+    n, m = observation.shape[-1], state.q.shape[-1]
+    fresh = ~state.started if restart is None else ~state.started | restart
+    statistics = _unit(observation) if residuals is None else residuals
+    half_range = _vector(observation, config.half_range, m)
+    process_noise = half_range * _chosen(config.process_noise, statistics.process_noise)
+    initial = torch.diag_embed((half_range * config.initial_deviation).square())
+    prior = Posterior(
+        state.sigma_m.masked_fill(fresh, 0.0),
+        torch.where(
+            fresh.unsqueeze(-1),
+            initial,
+            kalman.time_update(state.covariance.unflatten(-1, (m, m)), process_noise),
+        ),
+    )
+    jacobian = state.jacobian.masked_fill(fresh, 0.0).unflatten(-1, (n, m))
+    innovation = (observation - state.x_hat).masked_fill(fresh, 0.0)
+    expected = (jacobian @ prior.mean.unsqueeze(-1)).squeeze(-1)
+    residual = innovation + expected
+
+    covariance = _expected_covariance(config, state, statistics, fresh)
+    noise = state.noise.masked_fill(fresh, 1.0)
+    larger = noise.clamp_min(1.0)
+    # From observations that are noisier than its data were, a model errs in a lasting way too: the
+    # policy reacts to the noise, and the mean of a nonlinear function is not that of its argument.
+    scale = (larger * larger.mean(-1, keepdim=True)).sqrt().unsqueeze(-1)
+    columns, white = whitened(covariance, jacobian / scale, innovation.unsqueeze(-1) / scale)
+    white = white.squeeze(-1)
+    posterior = kalman.measurement_update(prior, columns, white)
+    if config.forgetting < 1:
+        # A residual far beyond what is expected counts for as much less, at once.
+        doubt = kalman.doubt(columns, white, posterior.mean - prior.mean).sqrt()
+        posterior = kalman.measurement_update(prior, columns / doubt.unsqueeze(-1), white / doubt)
+        left = residual - (jacobian @ posterior.mean.unsqueeze(-1)).squeeze(-1)
+        ratio = kalman.noise_ratio(covariance, jacobian, posterior, left)
+        noise = torch.where(fresh, noise, torch.lerp(ratio, noise, config.forgetting))
+
+    flat = posterior.covariance.flatten(-2)
+    finite = is_finite(torch.cat([observation, posterior.mean, flat, noise], -1))
+    posterior = Posterior(
+        project(config, posterior.mean.masked_fill(~finite, 0.0)),
+        posterior.covariance.masked_fill(~finite.unsqueeze(-1), 0.0),
+    )
+    effect = (jacobian @ posterior.mean.unsqueeze(-1)).squeeze(-1)
+    return Estimate(posterior, noise, innovation, residual, effect, finite)
+
+
+def adapted(config: L1Config, estimated: Estimate, u_rl: Tensor) -> Tensor:
+    """The input that cancels what of an estimate is significant, within the bounds."""
+    q = kalman.significant(estimated.posterior, config.dead_zone)
+    return narrow(saturate(config, wide(u_rl) - q), u_rl.dtype)
+
+
+def follow(
+    config: L1Config,
+    state: L1State,
+    estimated: Estimate,
+    observation: Tensor,
+    u_rl: Tensor,
+    change: Tensor,
+    jacobian: Tensor,
+    u_bar: Tensor | None = None,
+    residuals: ResidualStatistics | None = None,
+) -> tuple[Tensor, L1State, Terms]:
+    """The input, the next state and the terms of the diagnostics after :func:`estimate`.
+
+    Args:
+        config: the settings.
+        state: that the estimate was made of.
+        estimated: the estimate.
+        observation: as in :func:`step`.
+        u_rl: the policy's action within its bounds ``(..., m)``.
+        change: of the model at ``u_bar`` ``(..., n)``, state units per step.
+        jacobian: as in :func:`step`.
+        u_bar: operating point ``(..., m)``; zero if ``None``.
+        residuals: as in :func:`step`, at this step's input where they depend on it.
+
+    Returns:
+        as :func:`respond`.
+    """
+    dtype, policy = state.x_hat.dtype, u_rl
+    observation, u_rl, change, jacobian = map(wide, (observation, u_rl, change, jacobian))
+    posterior = estimated.posterior
+    q = kalman.significant(posterior, config.dead_zone)
+    unbounded = u_rl - q
+    u = saturate(config, unbounded)
+    step_u = (u if u_bar is None else u - wide(u_bar)) + posterior.mean
+    x_hat = observation + change + (jacobian @ step_u.unsqueeze(-1)).squeeze(-1)
+
+    finite = estimated.finite & is_finite(jacobian.flatten(-2))
+    finite = finite & credible(config, dtype, estimated.innovation, observation, x_hat)
+    non_finite = ~finite
+    reach = like(observation, config.half_range)
+    invisible = without_effect(jacobian, torch.maximum(observation.abs(), x_hat.abs()), reach)
+    jacobian = jacobian * ~invisible.unsqueeze(-2)
+    assert state.covariance is not None
+    following = L1State(
+        x_hat=x_hat.masked_fill(non_finite, 0.0),
+        u_bar=state.u_bar,
+        q=q,
+        sigma_m=posterior.mean,
+        n_switch=state.n_switch,
+        started=finite,
+        covariance=posterior.covariance.flatten(-2),
+        noise=estimated.noise.masked_fill(non_finite, 1.0),
+        jacobian=jacobian.flatten(-2).masked_fill(non_finite, 0.0),
+        residual_covariance=_remembered(state, residuals, non_finite),
+    )
+    terms = Terms(
+        -estimated.innovation,
+        estimated.residual,
+        estimated.effect_matched,
+        q,
+        u != unbounded,
+        invisible.any(-1, keepdim=True),
+        non_finite,
+        dtype,
+        posterior,
+    )
+    u = torch.where(finite, narrow(u, policy.dtype), policy)
+    return u, narrow_entries(following, dtype), terms
+
+
+def _expected_covariance(
+    config: L1Config, state: L1State, residuals: ResidualStatistics, fresh: Tensor
+) -> Tensor:
+    """Of the residual just seen ``(n, n)`` or ``(..., n, n)``."""
+    covariance = wide(residuals.covariance)
+    if state.residual_covariance is not None:
+        n = state.x_hat.shape[-1]
+        remembered = state.residual_covariance.unflatten(-1, (n, n))
+        eye = torch.eye(n, dtype=remembered.dtype, device=remembered.device)
+        covariance = torch.where(fresh.unsqueeze(-1), eye, remembered)
+    if config.estimator == "least_squares":
+        mean = covariance.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
+        covariance = mean * torch.eye(covariance.shape[-1], dtype=mean.dtype, device=mean.device)
+    return covariance * _chosen(config.inflation, residuals.inflation)
+
+
+def _remembered(
+    state: L1State, residuals: ResidualStatistics | None, non_finite: Tensor
+) -> Tensor | None:
+    if state.residual_covariance is None:
+        return None
+    assert residuals is not None, "a covariance that depends on state and action must be given"
+    shape = state.residual_covariance.shape
+    return residuals.covariance.flatten(-2).expand(shape).masked_fill(non_finite, 0.0)
+
+
+def _unit(observation: Tensor) -> ResidualStatistics:
+    n = observation.shape[-1]
+    return ResidualStatistics(torch.eye(n, dtype=observation.dtype, device=observation.device))
+
+
+def _chosen(setting: float | None, measured: Tensor | float) -> Tensor | float:
+    return measured if setting is None else setting
+
+
+def _vector(model: Tensor, value: Scalars, width: int) -> Tensor:
+    return torch.as_tensor(value, dtype=model.dtype, device=model.device).expand(width)

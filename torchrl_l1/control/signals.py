@@ -1,0 +1,181 @@
+"""What is done to the signals of every adaptive law: bounds, types, faults, diagnostics."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, TypeVar, cast
+
+import torch
+from torch import Tensor
+
+from torchrl_l1.control import kalman
+from torchrl_l1.control.config import L1Config, Scalars
+from torchrl_l1.control.kalman import Posterior
+from torchrl_l1.control.state import L1Diagnostics, L1State
+
+_HALF = (torch.float16, torch.bfloat16)
+
+Entries = TypeVar("Entries", L1State, L1Diagnostics)
+
+
+def saturate(config: L1Config, action: Tensor) -> Tensor:
+    """The action within the configured bounds."""
+    low, high = config.action_low, config.action_high
+    if isinstance(low, tuple) or isinstance(high, tuple):
+        # The configuration expands a number beside a tuple, so neither is a plain number here.
+        low_bound = None if low is None else like(action, low)
+        high_bound = None if high is None else like(action, high)
+        return torch.clamp(action, low_bound, high_bound)  # type: ignore[arg-type]
+    if low is None and high is None:
+        return action
+    return torch.clamp(action, _number(action, low), _number(action, high))
+
+
+def project(config: L1Config, sigma_m: Tensor) -> Tensor:
+    r"""The matched estimate within :attr:`L1Config.matched_bound`.
+
+    This is the projection of adaptive control for a box. The authors' formulas have none, but
+    least squares with an almost vanishing :math:`J` turns any prediction error into an estimate
+    without bound, and the low-pass filter would take long to forget it.
+    """
+    bound = config.matched_bound
+    if bound is None:
+        return sigma_m
+    if isinstance(bound, tuple):
+        limit = like(sigma_m, bound)
+        return torch.clamp(sigma_m, -limit, limit)  # type: ignore[operator]
+    number = cast(float, _number(sigma_m, bound))
+    return torch.clamp(sigma_m, -number, number)
+
+
+def like(tensor: Tensor, value: Scalars) -> Tensor | float:
+    """A setting to compute with: numbers stay numbers, they need no device and cost no kernel."""
+    if isinstance(value, tuple):
+        return torch.tensor(value, dtype=tensor.dtype, device=tensor.device)
+    return value
+
+
+def _number(tensor: Tensor, bound: Scalars | None) -> float | None:
+    """A bound that the tensor's type can hold, which torch insists on."""
+    if bound is None or isinstance(bound, tuple) or math.isinf(bound):
+        return cast(float | None, bound)
+    largest = torch.finfo(tensor.dtype).max
+    return min(max(bound, -largest), largest)
+
+
+def wide(tensor: Tensor) -> Tensor:
+    """The tensor in a type that can be computed with: half precision in single precision.
+
+    Normal equations square the condition, and squares of half-precision numbers overflow at 256.
+    """
+    return tensor.float() if tensor.dtype in _HALF else tensor
+
+
+def wide_state(state: L1State) -> L1State:
+    """:func:`wide` of each entry."""
+    if state.x_hat.dtype not in _HALF:
+        return state
+    return L1State(**{name: wide(value) for name, value in state.entries().items()})
+
+
+def narrow(tensor: Tensor, dtype: torch.dtype) -> Tensor:
+    """The tensor in a type, with what that cannot hold as its largest number."""
+    if tensor.dtype == dtype or not tensor.is_floating_point():
+        return tensor
+    largest = torch.finfo(dtype).max
+    return tensor.clamp(-largest, largest).to(dtype)
+
+
+def narrow_entries(entries: Entries, dtype: torch.dtype) -> Entries:
+    """:func:`narrow` of each entry of a state or of diagnostics."""
+    if dtype not in _HALF:
+        return entries
+    values = (None if value is None else narrow(value, dtype) for value in entries)
+    return type(entries)(*values)
+
+
+def credible(config: L1Config, dtype: torch.dtype, x_err: Tensor, *states: Tensor) -> Tensor:
+    """Whether a step's numbers can be reckoned with: ``(..., 1)``, bool.
+
+    None of them may be infinite or no number, the prediction error may not exceed
+    :attr:`L1Config.max_error`, and no state may be so large that its last digit does.
+
+    Args:
+        config: the settings.
+        dtype: type of the state.
+        x_err: prediction error ``(..., n)``.
+        states: observations and predictions, each ``(..., n)``.
+    """
+    # Norms are sums of squares.
+    limit = min(config.max_error, 1e-3 * torch.finfo(x_err.dtype).max ** 0.5)
+    kind = torch.finfo(dtype)
+    rounding = max(kind.eps, limit / kind.max)
+    largest = torch.linalg.vector_norm(
+        torch.cat([x_err, *(rounding * state for state in states)], -1), torch.inf, -1, True
+    )
+    return largest <= limit  # a comparison with what is not a number is false
+
+
+class Terms(NamedTuple):
+    """What of a step :func:`diagnose` makes its signals of, in state units per step.
+
+    Attributes:
+        x_err: state prediction error ``(..., n)``.
+        estimate: the uncertainty estimate ``(..., n)``.
+        effect_matched: its part that an action could cancel ``(..., n)``.
+        q: next filter state ``(..., m)``.
+        cut: entries of the action that a bound cut ``(..., m)``, bool.
+        ill_conditioned: see :func:`~torchrl_l1.control.solve_matched`.
+        non_finite: an input was not finite, or beyond belief ``(..., 1)``, bool.
+        dtype: type of the state.
+        posterior: of the matched disturbance, with a Kalman filter.
+    """
+
+    x_err: Tensor
+    estimate: Tensor
+    effect_matched: Tensor
+    q: Tensor
+    cut: Tensor
+    ill_conditioned: Tensor
+    non_finite: Tensor
+    dtype: torch.dtype
+    posterior: Posterior | None = None
+
+
+def diagnose(
+    config: L1Config,
+    terms: Terms,
+    switch: Tensor | None = None,
+    affinization_error: Tensor | None = None,
+) -> L1Diagnostics:
+    """The diagnostics of a step, with those of the switching law if they are given."""
+    x_err, estimate, effect_matched, q, cut, ill_conditioned, non_finite, dtype, posterior = terms
+    norms = torch.linalg.vector_norm(
+        torch.stack([x_err, effect_matched, estimate - effect_matched], dim=-2), dim=-1
+    )
+    prediction_error, matched, unmatched = norms.masked_fill(non_finite, 0.0).split(1, dim=-1)
+    diagnostics = L1Diagnostics(
+        switch=torch.zeros_like(non_finite) if switch is None else switch,
+        affinization_error=(
+            torch.zeros_like(prediction_error)
+            if affinization_error is None
+            else wide(affinization_error)
+        ),
+        prediction_error=prediction_error,
+        matched=matched / config.dt,
+        unmatched=unmatched / config.dt,
+        u_a=torch.linalg.vector_norm(q, dim=-1, keepdim=True).clamp_max(torch.finfo(q.dtype).max),
+        saturation=(cut & ~non_finite).to(q.dtype).mean(-1, keepdim=True),
+        ill_conditioned=ill_conditioned,
+        non_finite=non_finite,
+        **_significance(posterior, prediction_error),
+    )
+    return narrow_entries(diagnostics, dtype)
+
+
+def _significance(posterior: Posterior | None, like: Tensor) -> dict[str, Tensor]:
+    if posterior is None:
+        zero = torch.zeros_like(like)
+        return {"posterior_deviation": zero, "significance": zero}
+    deviation, significance = kalman.summary(posterior)
+    return {"posterior_deviation": deviation, "significance": significance}
