@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,14 +22,12 @@ from scipy.linalg import solve_discrete_are
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.envs import Compose, EnvBase, GymEnv, TransformedEnv
+from torchrl.envs import Compose, GymEnv, TransformedEnv
 
 from torchrl_l1.control import L1Config, L1Transform
-from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, fit_dynamics
+from torchrl_l1.dynamics import EnsembleDynamics, fit_dynamics
 from torchrl_l1.envs import ActuatorBias, make_env
 from torchrl_l1.experiment.run_directory import write_table
-from torchrl_l1.report.page import markdown
-from torchrl_l1.report.style import color, grid, legend_below, save
 
 Row = dict[str, str | float]
 Law = Callable[[Tensor], Tensor]

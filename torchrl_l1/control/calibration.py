@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchrl_l1.control import kalman, law
+from torchrl_l1.control import kalman, kalman_law
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.state import L1State, ResidualStatistics, init
 
@@ -173,17 +173,17 @@ def replay(
     state = init([candidates, sequences], n, m, config, dtype=residual.dtype)
     zero = torch.zeros_like(state.x_hat)
     # The first step starts the filter, and knows nothing yet.
-    estimated = law.estimate(config, state, zero, statistics)
+    estimated = kalman_law.estimate(config, state, zero, statistics)
     means, variances = [], []
     for t in range(steps):
         state = _before(state, estimated, jacobian[:, t])
-        estimated = law.estimate(config, state, residual[:, t].expand_as(zero), statistics)
+        estimated = kalman_law.estimate(config, state, residual[:, t].expand_as(zero), statistics)
         means.append(estimated.posterior.mean)
         variances.append(estimated.posterior.covariance.diagonal(dim1=-2, dim2=-1))
     return torch.stack(means, -2), torch.stack(variances, -2)
 
 
-def _before(state: L1State, estimated: law.Estimate, jacobian: Tensor) -> L1State:
+def _before(state: L1State, estimated: kalman_law.Estimate, jacobian: Tensor) -> L1State:
     """The state before a residual that is seen through this Jacobian."""
     posterior = estimated.posterior
     return state._replace(
