@@ -15,6 +15,7 @@ from torchrl_l1.compilation import CompileMode, compiled
 from torchrl_l1.control import kalman_law, law
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import ActionJacobian
+from torchrl_l1.control.probe import FORWARD_MODE
 from torchrl_l1.control.signals import diagnose, saturate
 from torchrl_l1.control.state import L1Diagnostics, L1State
 
@@ -287,7 +288,24 @@ def make_step(
     # Environments keep their batch size, so graphs with free sizes would only cost: and torch
     # cannot make dual tensors of them, which forward-mode Jacobians need.
     whole = compiled(cast(FunctionType, step), mode, dynamic=False)
-    return partial(_in_blocks, whole) if model.blockwise else whole
+    whole = partial(_in_blocks, whole) if model.blockwise else whole
+    return partial(_prepared, whole, config, model)
+
+
+def _prepared(
+    step: StepFunction,
+    config: L1Config,
+    model: ActionJacobian,
+    state: L1State,
+    observation: Tensor,
+    u_rl: Tensor,
+) -> Step:
+    """The step of a model that has been looked at: at the first one it is."""
+    if model.ready or torch.compiler.is_compiling():
+        return step(state, observation, u_rl)
+    with FORWARD_MODE:  # where the step is compiled, torch differentiates while it traces
+        model.prepare(observation, saturate(config, u_rl))
+        return step(state, observation, u_rl)
 
 
 def _in_blocks(step: StepFunction, state: L1State, observation: Tensor, u_rl: Tensor) -> Step:

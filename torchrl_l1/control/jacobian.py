@@ -12,10 +12,17 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
+from torchrl_l1.control.probe import (
+    FORWARD_MODE,
+    ChangeFunction,
+    Mode,
+    describe,
+    probe,
+    refuse_training,
+)
 from torchrl_l1.control.state import ResidualStatistics
 
 Predicts = Literal["change", "next_observation"]
-ChangeFunction = Callable[[Tensor, Tensor], Tensor]
 Expansion = tuple[Tensor, Callable[[Tensor], tuple[Tensor, Tensor]]]
 
 
@@ -43,6 +50,11 @@ class ActionJacobian:
     The Jacobian is analytic where the model has a ``value_and_jacobian`` method. Otherwise the
     m unit tangents of the action are pushed forward through the model on the whole batch
     (forward-mode differentiation under ``vmap``), at the cost of about ``1 + m`` forward passes.
+    Models with a layer that has no forward mode (LSTM, fused attention) take ``n`` backward passes
+    instead, said in a warning. Threads may share a model; they take turns in forward mode.
+
+    The first use looks at the model once, see :meth:`prepare`. Train mode is refused where a layer
+    is random in it or mixes the rows of a batch (dropout, batch norm).
 
     The model is referred to, never copied nor registered as a submodule: weights updated in
     place are seen at the next call, and it keeps its own device and train mode.
@@ -54,14 +66,16 @@ class ActionJacobian:
         action_key: key under which it reads the action.
         out_key: key of its prediction; needed if it has several output keys.
         predicts: whether it predicts the ``"change"`` of state or the ``"next_observation"``. If
-            ``None``, a TensorDictModule that writes ``("next", observation_key)`` or
-            ``observation_key`` itself predicts the latter, any other model the former.
+            ``None``, the key that a TensorDictModule writes tells: a name with ``change``,
+            ``delta`` or the like means the former; one under ``"next"``, with ``next`` in it, or
+            that of the observation, the latter; any other is refused. A model without keys predicts
+            the change.
         ensemble_dim: dimension of its output over which the mean is taken, for a module that
             returns one prediction per ensemble member.
 
     Raises:
         TypeError: if ``dynamics`` is none of the above.
-        ValueError: if the options do not fit the model.
+        ValueError: if the options do not fit the model, or do not tell what it predicts.
 
     Examples:
         >>> jacobian = ActionJacobian(lambda x, u: 0.1 * x + u.square() @ torch.ones(1, 3))
@@ -101,8 +115,8 @@ class ActionJacobian:
         elif isinstance(dynamics, TensorDictModuleBase):
             out_key = _prediction_key(dynamics, observation_key, action_key, out_key)
             self._predict = _on_tensors(dynamics, observation_key, action_key, out_key)
-            if predicts is None and _is_observation(out_key, observation_key):
-                predicts = "next_observation"
+            if predicts is None:
+                predicts = _told_by(out_key, observation_key)
         elif callable(dynamics):
             if out_key is not None:
                 raise ValueError("out_key applies to TensorDictModules only")
@@ -113,6 +127,9 @@ class ActionJacobian:
                 f"TensorDictModule or a callable, got {type(dynamics).__name__}"
             )
         self.predicts: Predicts = predicts or "change"
+        self._mode: Mode | None = None
+        self._lifted = False
+        self._training: object = None
         if not self.analytic:
             _load_forward_mode()
 
@@ -135,9 +152,70 @@ class ActionJacobian:
                     f"width {width}"
                 )
 
+    @property
+    def ready(self) -> bool:
+        """Whether the model has been looked at, and not been put into another mode since."""
+        training = getattr(self.dynamics, "training", None)
+        return self._mode is not None and training is self._training
+
+    def prepare(self, observation: Tensor, action: Tensor) -> None:
+        """Look at the model before its first use, and after ``train()`` and ``eval()``.
+
+        One plain call gives lazy layers their weights; then what L1 asks of a model is tried on
+        these data: a finite prediction of the right type and shape, the same at each call and
+        whatever the other rows of the batch are, with a derivative. No global random number is
+        drawn. A model that is :attr:`ready` is left alone.
+
+        Args:
+            observation: ``(..., n)`` of a first step.
+            action: ``(..., m)``.
+
+        Raises:
+            TypeError: if the prediction is no tensor of the observation's type.
+            ValueError: if the model does not keep one of the above.
+            RuntimeError: if it cannot be differentiated.
+        """
+        with FORWARD_MODE:
+            if self.ready:
+                return
+            training = getattr(self.dynamics, "training", None)
+            modes: dict[Mode, Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]]
+            if self.analytic:
+                modes = {"analytic": self._analytically}
+                mode = probe(
+                    self.dynamics,
+                    lambda x, u: self._analytically(x, u)[0],
+                    modes,
+                    observation,
+                    action,
+                )
+            else:
+                self._lift(observation, action)
+                modes = {"forward": self._forward_mode, "reverse": self._reverse_mode}
+                mode = probe(self.dynamics, self.value, modes, observation, action)
+            self._mode, self._training = mode, training
+
+    def _lift(self, observation: Tensor, action: Tensor) -> None:
+        """Find out whether the model insists on a batch dimension, as batch norm does."""
+        if observation.ndim > 1:
+            return
+        refuse_training(self.dynamics)
+        with torch.no_grad(), torch.random.fork_rng([]):
+            try:
+                self.value(observation, action)
+            except (RuntimeError, ValueError, IndexError):
+                self._lifted = True
+                try:
+                    self.value(observation, action)
+                except Exception:
+                    self._lifted = False
+
     def value(self, observation: Tensor, action: Tensor) -> Tensor:
         """Predicted change of state: ``(..., n)`` and ``(..., m)`` to ``(..., n)``."""
+        if self._lifted and observation.ndim == 1:
+            return self.value(observation.unsqueeze(0), action.unsqueeze(0)).squeeze(0)
         prediction = self._predict(observation, action)
+        self._check_type(prediction, observation)
         if self.ensemble_dim is not None:
             prediction = prediction.mean(self.ensemble_dim)
         if prediction.shape != observation.shape:
@@ -151,9 +229,28 @@ class ActionJacobian:
 
     def value_and_jacobian(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Predicted change ``(..., n)`` and its derivative by the action ``(..., n, m)``."""
-        if not self.analytic:
-            return self._forward_mode(observation, action)
+        if self.analytic:
+            return self._analytically(observation, action)
+        if self._differentiates(observation, action) == "reverse":
+            return self._reverse_mode(observation, action)
+        return self._forward_mode(observation, action)
+
+    def _check_type(self, returned: object, observation: Tensor) -> None:
+        if not isinstance(returned, Tensor):
+            raise TypeError(
+                f"{describe(self.dynamics)} returned {type(returned).__name__}, expected a tensor "
+                f"of {observation.dtype}"
+            )
+        if returned.dtype != observation.dtype:
+            raise TypeError(
+                f"{describe(self.dynamics)} returned {returned.dtype} for observations of "
+                f"{observation.dtype}: let it return the observation's type"
+            )
+
+    def _analytically(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         value, jacobian = self.dynamics.value_and_jacobian(observation, action)  # type: ignore[union-attr]
+        for returned in (value, jacobian):
+            self._check_type(returned, observation)
         expected = (*observation.shape, action.shape[-1])
         if jacobian.shape != expected:
             raise ValueError(
@@ -161,6 +258,11 @@ class ActionJacobian:
                 f"{tuple(jacobian.shape)}, expected {expected}"
             )
         return value, jacobian
+
+    def _differentiates(self, observation: Tensor, action: Tensor) -> Mode:
+        if not self.ready and not _is_traced():
+            self.prepare(observation, action)
+        return self._mode or "forward"
 
     __call__ = value_and_jacobian
 
@@ -174,12 +276,12 @@ class ActionJacobian:
         if callable(analytic):
             return analytic(observation, u_bar, action)
         step = action - u_bar
-        if self.analytic:
+        if self.analytic or self._differentiates(observation, u_bar) == "reverse":
             value, jacobian = self.value_and_jacobian(observation, u_bar)
             slope = (jacobian @ step.unsqueeze(-1)).squeeze(-1)
         else:
-            value, slope, *_ = torch.func.jvp(
-                lambda u: self.value(observation, u), (u_bar,), (step,)
+            value, slope = _pushed_forward(
+                lambda: torch.func.jvp(lambda u: self.value(observation, u), (u_bar,), (step,))
             )
         return self.value(observation, action) - value - slope
 
@@ -224,10 +326,27 @@ class ActionJacobian:
         if self.blockwise:
             return self.dynamics.expansion(observation, u_bar, candidate, tested)  # type: ignore[union-attr]
 
+        if not self.analytic and self._differentiates(observation, u_bar) == "reverse":
+            return self._reverse_expansion(observation, u_bar, candidate, tested)
+
         def at(moved: Tensor) -> tuple[Tensor, Tensor]:
             return self.value_and_jacobian(observation, torch.where(moved, candidate, u_bar))
 
         return self.taylor_remainder(observation, u_bar, tested), at
+
+    def _reverse_expansion(
+        self, observation: Tensor, u_bar: Tensor, candidate: Tensor, tested: Tensor
+    ) -> Expansion:
+        """:meth:`expansion` without a second Jacobian where no row moves."""
+        value, jacobian = self._reverse_mode(observation, u_bar)
+        slope = (jacobian @ (tested - u_bar).unsqueeze(-1)).squeeze(-1)
+
+        def at(moved: Tensor) -> tuple[Tensor, Tensor]:
+            if not _is_traced() and not bool(moved.any()):
+                return value, jacobian
+            return self._reverse_mode(observation, torch.where(moved, candidate, u_bar))
+
+        return self.value(observation, tested) - value - slope, at
 
     def _forward_mode(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         def push_forward(tangent: Tensor) -> tuple[Tensor, ...]:
@@ -236,17 +355,61 @@ class ActionJacobian:
             )
 
         basis = torch.eye(action.shape[-1], dtype=action.dtype, device=action.device)
-        # The value does not depend on the tangent: it comes out once, without a new dimension.
-        out_dims: Any = (None, -1)
-        value, jacobian = torch.func.vmap(push_forward, out_dims=out_dims)(basis)
-        return value, jacobian
+        # The value does not depend on the tangent: it comes out once, without a new dimension. Nor
+        # does the tangent's image where the action has no effect, which torch cannot put last.
+        out_dims: Any = (None, 0)
+        value, jacobian = _pushed_forward(
+            lambda: torch.func.vmap(push_forward, out_dims=out_dims)(basis)
+        )
+        return value, jacobian.movedim(0, -1)
+
+    def _reverse_mode(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Value and Jacobian, one backward pass per state; the rows of a batch are independent."""
+        if _is_traced():
+            value, pull_back = torch.func.vjp(lambda u: self.value(observation, u), action)
+            basis = torch.eye(value.shape[-1], dtype=value.dtype, device=value.device)
+            rows = [pull_back(row.expand_as(value))[0] for row in basis.unbind(0)]
+            return value, torch.stack(rows, -2)
+        # torch's function transforms lack layers that plain reverse mode has.
+        with torch.inference_mode(False), torch.enable_grad():
+            u = action.detach().clone().requires_grad_()
+            value = self.value(observation.detach().clone(), u)
+            last = value.shape[-1] - 1
+            rows = [
+                _gradient(value[..., i].sum(), u, retain_graph=i < last) for i in range(last + 1)
+            ]
+        return value.detach(), torch.stack(rows, -2)
+
+
+def _gradient(output: Tensor, u: Tensor, *, retain_graph: bool) -> Tensor:
+    if not output.requires_grad:
+        return torch.zeros_like(u)
+    (row,) = torch.autograd.grad(
+        output, u, retain_graph=retain_graph, allow_unused=True, materialize_grads=True
+    )
+    return row
+
+
+def _is_traced() -> bool:
+    """Whether a compiler looks on, or one of torch's function transforms."""
+    return torch.compiler.is_compiling() or torch._C._functorch.peek_interpreter_stack() is not None
+
+
+def _pushed_forward(compute: Callable[[], Any]) -> tuple[Tensor, Tensor]:
+    """Two results of forward mode, for one thread at a time."""
+    if torch.compiler.is_compiling():  # traced, there are no levels left
+        value, tangent = compute()
+    else:
+        with FORWARD_MODE:
+            value, tangent = compute()
+    return value, tangent
 
 
 def _load_forward_mode() -> None:
     # The first jvp of a process loads torch's decompositions, which warn of torch's own
     # deprecations. Get that over with here, where it can be silenced without hiding anything
     # that the model itself may warn of.
-    with warnings.catch_warnings():
+    with FORWARD_MODE, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.func.jvp(torch.sin, (torch.zeros(()),), (torch.ones(()),))
 
@@ -274,9 +437,29 @@ def _prediction_key(
     return out_key
 
 
-def _is_observation(key: NestedKey, observation_key: NestedKey) -> bool:
-    following = unravel_key(("next", observation_key))
-    return unravel_key(key) in (unravel_key(observation_key), following)
+_CHANGE = {"change", "changes", "delta", "deltas", "diff", "difference", "increment", "dx", "dobs"}
+_NEXT = {"next", "following", "successor"}
+
+
+def _told_by(out_key: NestedKey, observation_key: NestedKey) -> Predicts:
+    """What a module predicts, by the key that it writes."""
+    path, observed = _path(out_key), _path(observation_key)
+    if path in (observed, ("next", *observed)):
+        return "next_observation"
+    words = set(path[-1].lower().replace("-", "_").split("_"))
+    if words & _CHANGE or path[-1].startswith("d_"):
+        return "change"
+    if path[0] == "next" or words & _NEXT:
+        return "next_observation"
+    raise ValueError(
+        f"the dynamics module writes {out_key!r}, which does not tell what it predicts: give "
+        "predicts='change' or predicts='next_observation'"
+    )
+
+
+def _path(key: NestedKey) -> tuple[str, ...]:
+    key = unravel_key(key)
+    return (key,) if isinstance(key, str) else key
 
 
 def _on_tensors(

@@ -185,9 +185,14 @@ def as_action_jacobian(
     observation_key: NestedKey,
     action_key: NestedKey,
     predicts: Predicts | None = None,
+    *,
+    out_key: NestedKey | None = None,
+    ensemble_dim: int | None = None,
 ) -> ActionJacobian:
     """The dynamics as an :class:`ActionJacobian`, which is returned as it is."""
     if isinstance(dynamics, ActionJacobian):
+        if out_key is not None or ensemble_dim is not None:
+            raise ValueError("give out_key and ensemble_dim to the ActionJacobian")
         if predicts not in (None, dynamics.predicts):
             raise ValueError(
                 f"predicts={predicts!r} was given, but the ActionJacobian has "
@@ -195,7 +200,12 @@ def as_action_jacobian(
             )
         return dynamics
     return ActionJacobian(
-        dynamics, observation_key=observation_key, action_key=action_key, predicts=predicts
+        dynamics,
+        observation_key=observation_key,
+        action_key=action_key,
+        predicts=predicts,
+        out_key=out_key,
+        ensemble_dim=ensemble_dim,
     )
 
 

@@ -1,0 +1,290 @@
+"""One look at a model before its first step: does it keep what L1 asks of a model?"""
+
+from __future__ import annotations
+
+import functools
+import os
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+Mode = Literal["analytic", "forward", "reverse"]
+ChangeFunction = Callable[[Tensor, Tensor], Tensor]
+JacobianFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+MOST_ROWS = 256
+"""Larger batches are probed on their first rows."""
+
+_LARGEST = 1e6  # What is larger is not looked at: squares of it may overflow in an honest model.
+
+_RANDOM = (nn.modules.dropout._DropoutNd, nn.RReLU)
+
+
+class _ForkSafeLock:
+    """A reentrant lock, free in a process that was forked while another thread held it."""
+
+    def __init__(self) -> None:
+        self._renew()
+        if hasattr(os, "register_at_fork"):
+            os.register_at_fork(after_in_child=self._renew)
+
+    def _renew(self) -> None:
+        self._lock = threading.RLock()
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+
+FORWARD_MODE = _ForkSafeLock()
+"""Held while torch differentiates in forward mode, whose levels all threads of a process share."""
+
+
+def probe(
+    dynamics: object,
+    change: ChangeFunction,
+    jacobians: Mapping[Mode, JacobianFunction],
+    observation: Tensor,
+    action: Tensor,
+) -> Mode:
+    """Look at a model on the data of a first step and choose how it is differentiated.
+
+    The first call is a plain one, which gives lazy layers their weights before torch's function
+    transforms meet them. No global random number is drawn. Data that are not finite, or beyond
+    1e6, are replaced by zeros.
+
+    Args:
+        dynamics: the model, to be named in errors.
+        change: its predicted change ``(..., n)``; checks type and shape of its result.
+        jacobians: functions of value and Jacobian by mode, in the order of preference.
+        observation: ``(..., n)``.
+        action: ``(..., m)``.
+
+    Returns:
+        the first mode that works. A mode that is not the first one is worth a warning, and so is a
+        prediction that does not depend on the action.
+
+    Raises:
+        TypeError: if the prediction is no tensor of the observation's type.
+        ValueError: if its shape is wrong, if it is not finite, if it changes from call to call, or
+            with the other rows of a batch, or has no derivative although it depends on the action;
+            if a layer is in train mode that must not be.
+        RuntimeError: if no mode works.
+    """
+    refuse_training(dynamics)
+    observation, action = _moderate(observation), _moderate(action)
+    rows = observation.shape[:-1].numel()
+    if rows > MOST_ROWS:
+        observation = observation.reshape(rows, -1)[:MOST_ROWS]
+        action = action.reshape(rows, -1)[:MOST_ROWS]
+    devices = [observation.device] if observation.device.type == "cuda" else []
+    with torch.no_grad(), torch.random.fork_rng(devices):
+        value = change(observation, action)
+        _check_repeatable(dynamics, change, observation, action, value)
+        _check_rows(dynamics, change, observation, action, value)
+        return _choose_mode(dynamics, change, jacobians, observation, action, value)
+
+
+def refuse_training(dynamics: object) -> None:
+    """Refuse layers that are random, or mix the rows of a batch, in train mode.
+
+    Raises:
+        ValueError: which names the first such layer and what to do about it.
+    """
+    for root in _modules(dynamics):
+        for name, layer in root.named_modules():
+            if layer.training and _needs_eval(layer):
+                raise ValueError(
+                    f"{describe(dynamics)} is in train mode, in which its layer "
+                    f"{_label(name, layer)} gives L1 another prediction at each call or mixes the "
+                    "environments of a batch: call its eval() before the first step, and again "
+                    "after each fit"
+                )
+
+
+def _needs_eval(layer: nn.Module) -> bool:
+    if isinstance(layer, _RANDOM):
+        return getattr(layer, "p", 1.0) > 0
+    if isinstance(layer, nn.RNNBase):
+        return layer.dropout > 0 and layer.num_layers > 1
+    if isinstance(layer, nn.MultiheadAttention):
+        return layer.dropout > 0
+    if isinstance(layer, nn.modules.batchnorm._BatchNorm):
+        return True
+    return isinstance(layer, nn.modules.batchnorm._NormBase) and layer.track_running_stats
+
+
+def _modules(dynamics: object) -> Iterator[nn.Module]:
+    """The modules that a model consists of, as far as they can be found."""
+    if isinstance(dynamics, nn.Module):
+        yield dynamics
+    elif isinstance(dynamics, functools.partial):
+        for part in (dynamics.func, *dynamics.args, *dynamics.keywords.values()):
+            yield from _modules(part)
+    elif hasattr(dynamics, "__self__"):
+        yield from _modules(dynamics.__self__)
+    else:
+        held = list(vars(dynamics).values()) if hasattr(dynamics, "__dict__") else []
+        for cell in getattr(dynamics, "__closure__", None) or ():
+            with suppress(ValueError):  # an empty cell
+                held.append(cell.cell_contents)
+        yield from (part for part in held if isinstance(part, nn.Module))
+
+
+def _moderate(data: Tensor) -> Tensor:
+    return torch.where(data.abs() <= _LARGEST, data, 0.0)
+
+
+def _differ(a: Tensor, b: Tensor, observation: Tensor) -> bool:
+    """Whether two predictions of a change, from this observation, differ by more than rounding."""
+    size = max(float(x.abs().max()) if x.numel() else 0.0 for x in (a, observation))
+    return not bool(((a - b).abs() <= 16 * torch.finfo(a.dtype).eps * size).all())
+
+
+def _check_repeatable(
+    dynamics: object, change: ChangeFunction, observation: Tensor, action: Tensor, value: Tensor
+) -> None:
+    if not bool(value.isfinite().all()):
+        raise ValueError(
+            f"{describe(dynamics)} predicts what is not finite at the first observation and action"
+        )
+    if _differ(value, change(observation, action), observation):
+        raise ValueError(
+            f"{describe(dynamics)} predicts something else at each call for the same observation "
+            "and action: L1 needs the mean, without sampling or dropout (eval mode)"
+        )
+
+
+def _check_rows(
+    dynamics: object, change: ChangeFunction, observation: Tensor, action: Tensor, value: Tensor
+) -> None:
+    """Change one row of the batch and see whether another one answers."""
+    n = observation.shape[-1]
+    if observation.shape[:-1].numel() == 1:
+        # Alone in its batch. Two of it must be predicted like one for there to be batches.
+        twice = [torch.stack([data.reshape(-1)] * 2) for data in (observation, action)]
+        try:
+            pair = change(*twice)
+        except Exception:
+            return  # a function of vectors
+        if _differ(pair, value.reshape(1, n).expand(2, n), observation):
+            return
+        observation, action, value = *twice, pair
+    others = observation.clone().reshape(-1, n), action.clone().reshape(-1, action.shape[-1])
+    for data in others:
+        data[0] = 1.0 - 2.0 * data[0]
+    moved = change(others[0].reshape(observation.shape), others[1].reshape(action.shape))
+    if _differ(value.reshape(-1, n)[1:], moved.reshape(-1, n)[1:], observation):
+        raise ValueError(
+            f"{describe(dynamics)} mixes the rows of a batch: what it predicts for one environment "
+            "changes with the others' (batch norm in train mode, attention along the wrong "
+            "dimension); each row must be predicted by itself"
+        )
+
+
+def _choose_mode(
+    dynamics: object,
+    change: ChangeFunction,
+    jacobians: Mapping[Mode, JacobianFunction],
+    observation: Tensor,
+    action: Tensor,
+    value: Tensor,
+) -> Mode:
+    # Somewhere else: at one action an honest network may be dead or saturated.
+    others = [0.5 * action, -action, action + 1.0, action - 1.0]
+    failures: dict[Mode, Exception] = {}
+    flat: Mode | None = None
+    for mode, jacobian in jacobians.items():
+        try:
+            if any(bool((jacobian(observation, u)[1] != 0).any()) for u in [action, *others]):
+                _warn_of_reverse(dynamics, mode, failures, observation, action)
+                return mode
+            flat = flat or mode
+        except Exception as error:
+            failures[mode] = error
+    if flat is None:
+        if "analytic" in failures:
+            raise failures["analytic"]
+        raise RuntimeError(_no_mode(dynamics, failures)) from next(iter(failures.values()))
+    if any(_differ(value, change(observation, u), observation) for u in others):
+        raise ValueError(
+            f"{describe(dynamics)} predicts a change that depends on the action, but its "
+            "derivative by the action is zero: it is detached (detach, no_grad, NumPy) or "
+            "piecewise constant; keep the graph, or give the model a method "
+            "value_and_jacobian(observation, action)"
+        )
+    warnings.warn(
+        f"{describe(dynamics)} predicts a change that does not depend on the action: L1 flags each "
+        "step as ill conditioned and adds nothing",
+        stacklevel=2,
+    )
+    _warn_of_reverse(dynamics, flat, failures, observation, action)
+    return flat
+
+
+def _warn_of_reverse(
+    dynamics: object,
+    mode: Mode,
+    failures: Mapping[Mode, Exception],
+    observation: Tensor,
+    action: Tensor,
+) -> None:
+    if mode != "reverse":
+        return
+    n, m = observation.shape[-1], action.shape[-1]
+    error = failures.get("forward")
+    cause = "" if error is None else f", since {_culprit(dynamics, error)} has no forward mode"
+    warnings.warn(
+        f"{describe(dynamics)} is differentiated in reverse mode{cause}: a Jacobian takes {n} "
+        f"backward passes in place of {m} forward ones, and a step one Jacobian or two",
+        stacklevel=2,
+    )
+
+
+def _no_mode(dynamics: object, failures: Mapping[Mode, Exception]) -> str:
+    causes = "; ".join(f"{mode} mode: {_first_line(error)}" for mode, error in failures.items())
+    culprit = _culprit(dynamics, next(iter(failures.values())))
+    return (
+        f"{describe(dynamics)} cannot be differentiated at {culprit} ({causes}): write it in "
+        "differentiable operations of torch, or give the model a method "
+        "value_and_jacobian(observation, action)"
+    )
+
+
+def _first_line(error: Exception) -> str:
+    line = str(error).strip().partition("\n")[0]
+    return f"{type(error).__name__}: {line[:160]}"
+
+
+def _culprit(dynamics: object, error: Exception) -> str:
+    """The innermost module that was at work when the error was raised."""
+    names = {
+        id(layer): _label(name, layer)
+        for root in _modules(dynamics)
+        for name, layer in root.named_modules()
+    }
+    found = describe(dynamics)
+    trace = error.__traceback__
+    while trace is not None:
+        owner = trace.tb_frame.f_locals.get("self")
+        if isinstance(owner, nn.Module):
+            found = names.get(id(owner), type(owner).__name__)
+        trace = trace.tb_next
+    return found
+
+
+def _label(name: str, layer: nn.Module) -> str:
+    return f"{name} ({type(layer).__name__})" if name else type(layer).__name__
+
+
+def describe(dynamics: object) -> str:
+    """A model's name in a message."""
+    name = getattr(dynamics, "__qualname__", None)
+    return f"the model {name if isinstance(name, str) else type(dynamics).__name__}"
