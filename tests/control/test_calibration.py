@@ -24,14 +24,16 @@ def autocorrelated(sequences: int, steps: int, n: int, correlation: float) -> to
 def test_a_replay_is_the_regression_of_all_residuals_so_far():
     sequences, steps, n, m = 3, 25, 4, 2
     generator = torch.Generator().manual_seed(1)
-    residual = torch.randn(sequences, steps, n, generator=generator, dtype=torch.float64)
+    # Small, so that no estimate is beyond the bounds of the action.
+    residual = 0.01 * torch.randn(sequences, steps, n, generator=generator, dtype=torch.float64)
     jacobian = torch.randn(sequences, steps, n, m, generator=generator, dtype=torch.float64)
     deviation = torch.tensor([0.1, 1.0, 3.0, 0.5], dtype=torch.float64)
     config = L1Config.robust(
         0.02, process_noise=0.0, inflation=2.0, forgetting=1.0, project=False, **BOUNDS
     )
     statistics = ResidualStatistics(torch.diag(deviation.square()))
-    mean, variance = replay(config, residual, jacobian, statistics)
+    action = residual.new_zeros(sequences, steps, m)
+    mean, variance = replay(config, residual, jacobian, action, statistics)
     precision = torch.diag(1 / (2 * deviation.square()))
     # Ridge regression on the first k residuals, whose penalty is the prior's.
     for k in (1, 7, steps):

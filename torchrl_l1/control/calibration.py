@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrl_l1.control import kalman, kalman_law
 from torchrl_l1.control.config import L1Config
+from torchrl_l1.control.signals import saturate
 from torchrl_l1.control.state import L1State, ResidualStatistics, init
 
 INFLATIONS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
@@ -46,6 +47,7 @@ def calibrate(
     jacobian: Tensor,
     covariance: Tensor,
     *,
+    action: Tensor | None = None,
     inflations: Sequence[float] = INFLATIONS,
     process_noises: Sequence[float] = PROCESS_NOISES,
     generator: torch.Generator | None = None,
@@ -59,7 +61,8 @@ def calibrate(
     the estimation error :math:`\hat d^2 / P` has mean one. The bandwidth comes from the same
     episodes with disturbances put in: the filter's initial deviation with random signs, from the
     reset on in every other stretch and from a random moment on in the others, added to the
-    residuals as :math:`r_t + J_t d_t`. Neither needs the real system.
+    residuals as :math:`r_t + J_t d_t` within the bounds of the action. Neither needs the real
+    system.
 
     Args:
         config: the settings that the two belong to; those two of its own do not matter.
@@ -67,6 +70,7 @@ def calibrate(
             units.
         jacobian: of the model in the same steps ``(S, T, n, m)``.
         covariance: of the residuals ``(n, n)``.
+        action: that was executed in the same steps ``(S, T, m)``; zero if ``None``.
         inflations: those tried.
         process_noises: those tried.
         generator: of the disturbances put in; one with a fixed seed if ``None``.
@@ -103,9 +107,11 @@ def calibrate(
     disturbance = _steps(sequences, steps, m, generator).to(residual)
     disturbance = disturbance * config.initial_deviation * half_range
     disturbance = torch.cat([torch.zeros_like(disturbance), disturbance])
-    observed = residual.repeat(2, 1, 1) + (
-        jacobian.repeat(2, 1, 1, 1) @ disturbance.unsqueeze(-1)
-    ).squeeze(-1)
+    action = disturbance.new_zeros(sequences, steps, m) if action is None else action
+    residual, action = residual.repeat(2, 1, 1), action.repeat(2, 1, 1)
+    jacobian = jacobian.repeat(2, 1, 1, 1)
+    passed = saturate(config, action + disturbance) - action
+    residual = residual + (jacobian @ passed.unsqueeze(-1)).squeeze(-1)
 
     tried = [
         {"process_noise": noise, "inflation": inflation}
@@ -118,7 +124,7 @@ def calibrate(
         covariance, inflation[:, None, None, None], noise[:, None, None]
     )
     free = replace(config, process_noise=None, inflation=None)
-    mean, variance = replay(free, observed, jacobian.repeat(2, 1, 1, 1), statistics, len(tried))
+    mean, variance = replay(free, residual, jacobian, action, statistics, len(tried))
     posterior = kalman.Posterior(mean, torch.diag_embed(variance))
     left = (kalman.significant(posterior, config.dead_zone) - disturbance) / half_range
     error = left.square().mean((1, 2, 3)).sqrt()
@@ -153,6 +159,7 @@ def replay(
     config: L1Config,
     residual: Tensor,
     jacobian: Tensor,
+    action: Tensor,
     statistics: ResidualStatistics,
     candidates: int = 1,
 ) -> tuple[Tensor, Tensor]:
@@ -162,6 +169,7 @@ def replay(
         config: the settings.
         residual: ``(S, T, n)``, state units.
         jacobian: ``(S, T, n, m)``.
+        action: that was executed ``(S, T, m)``.
         statistics: of the residuals; what there is one of per candidate has as many leading
             entries.
         candidates: C.
@@ -176,18 +184,27 @@ def replay(
     estimated = kalman_law.estimate(config, state, zero, statistics)
     means, variances = [], []
     for t in range(steps):
-        state = _before(state, estimated, jacobian[:, t])
+        state = _before(config, state, estimated, jacobian[:, t], action[:, t])
         estimated = kalman_law.estimate(config, state, residual[:, t].expand_as(zero), statistics)
         means.append(estimated.posterior.mean)
         variances.append(estimated.posterior.covariance.diagonal(dim1=-2, dim2=-1))
     return torch.stack(means, -2), torch.stack(variances, -2)
 
 
-def _before(state: L1State, estimated: kalman_law.Estimate, jacobian: Tensor) -> L1State:
-    """The state before a residual that is seen through this Jacobian."""
+def _before(
+    config: L1Config,
+    state: L1State,
+    estimated: kalman_law.Estimate,
+    jacobian: Tensor,
+    action: Tensor,
+) -> L1State:
+    """The state before a residual that this action and Jacobian have led to."""
     posterior = estimated.posterior
+    action = action.expand_as(posterior.mean)
+    passed = kalman_law.Reach.of(config, action, posterior).passed
     return state._replace(
-        x_hat=(jacobian @ posterior.mean.unsqueeze(-1)).squeeze(-1),
+        x_hat=(jacobian @ passed.unsqueeze(-1)).squeeze(-1),
+        u_bar=action,
         sigma_m=posterior.mean,
         started=torch.ones_like(state.started),
         covariance=posterior.covariance.flatten(-2),

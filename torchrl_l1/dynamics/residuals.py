@@ -137,7 +137,9 @@ def calibrate_filter(
     whole = residual.isfinite().flatten(1).all(1) & jacobian.isfinite().flatten(1).all(1)
     if not whole.any():
         return None
-    found = calibrate(config, residual[whole], jacobian[whole], residuals.covariance)
+    found = calibrate(
+        config, residual[whole], jacobian[whole], residuals.covariance, action=action[whole]
+    )
     residuals.inflation.fill_(found.inflation)
     residuals.process_noise.fill_(found.process_noise)
     return found
