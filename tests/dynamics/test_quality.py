@@ -122,6 +122,35 @@ def test_a_model_that_diverges_is_told() -> None:
     assert "diverges" in str(quality)
 
 
+class Disagreeing(Known):
+    """Members whose gains are the mean's, less or more of a share."""
+
+    def __init__(self, share: float) -> None:
+        super().__init__(A, B)
+        self.factors = torch.tensor([1 - share, 1 + share])[:, None, None]
+
+    def member_changes(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        return observation @ (A.T - torch.eye(2)) + self.factors * (action @ B.T)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
+def test_members_that_disagree_on_the_gain_are_no_model_for_l1(share: float) -> None:
+    quality = measure_quality(Disagreeing(share), read_transitions(recorded(*[60] * 10)))
+    assert quality.gain_spread == pytest.approx(share, abs=1e-3)
+    assert bool(quality.warning) is (share > 0.3)
+    assert f"members differ by {100 * share:.1f} %" in str(quality)
+    if share > 0.3:
+        assert "differ by 50 % (more than 30 %) in what the action does" in quality.warning
+        assert quality.warning in str(quality)
+
+
+def test_an_error_is_given_as_the_input_that_looks_like_it() -> None:
+    data = recorded(*[60] * 10)
+    data["next", "observation"] += 0.7 * B.squeeze(-1)
+    quality = measure_quality(Disagreeing(0.0), read_transitions(data))
+    assert quality.input_error == (pytest.approx(0.7, rel=1e-3),)
+
+
 @pytest.mark.parametrize("given", [{"names": ["a"]}, {"units": ["m", "s", "kg"]}, {"names": "ab"}])
 def test_names_and_units_are_as_many_as_entries(given: dict[str, list[str]]) -> None:
     with pytest.raises(ValueError, match="must hold one for each of the observation's 2 entries"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from inspect import signature
@@ -297,6 +298,10 @@ def fit_dynamics(
         the model, in evaluation mode, with its :attr:`~EnsembleDynamics.quality`, which prints as
         a table.
 
+    Warns:
+        UserWarning: if rows of the data are left out, or if the model is too poor for L1 to be of
+            use.
+
     Raises:
         KeyError: if the data lack a key.
         TypeError: for a setting that does not exist.
@@ -331,6 +336,8 @@ def fit_dynamics(
         optimizer = torch.optim.Adam(dynamics.parameters(), lr=config.learning_rate)
         fit_to_transitions(dynamics, transitions, config, optimizer, on_epoch)
     dynamics.quality = measure_quality(dynamics, transitions, names, units)
+    if dynamics.quality.warning:
+        warnings.warn(dynamics.quality.warning, stacklevel=2)
     return dynamics.eval()
 
 
