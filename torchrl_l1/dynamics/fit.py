@@ -85,7 +85,12 @@ class FitConfig:
         resolve_precision(self.precision, name="fit.precision")
 
 
-FROM_SCRATCH = {"max_epochs": 200, "max_gradient_steps": 3000, "patience": 10, "batch_size": 256}
+FROM_SCRATCH: dict[str, Any] = {
+    "max_epochs": 200,
+    "max_gradient_steps": 3000,
+    "patience": 10,
+    "batch_size": 256,
+}
 """Settings of a :class:`FitConfig` for a model that is fitted once, by :func:`fit_dynamics`."""
 
 
