@@ -82,14 +82,14 @@ def test_time_step_of_serial_environments_once_they_run():
     env = SerialEnv(2, partial(skipping, 2))
     augmented = TransformedEnv(env, L1Transform(model))
     with pytest.raises(ValueError, match="knows dt once an environment is reset"):
-        augmented.transform.config  # noqa: B018
+        augmented.transform.config
     augmented.reset()
     assert augmented.transform.config.dt == pytest.approx(0.1)
 
 
 def test_an_environment_that_does_not_tell():
     env = TransformedEnv(GymWrapper(Silent()), L1Transform(model))
-    with pytest.raises(ValueError, match="L1Transform needs dt, .* the environment does not tell"):
+    with pytest.raises(ValueError, match=r"L1Transform needs dt, .* the environment does not tell"):
         env.transform._complete()
     TransformedEnv(GymWrapper(Silent()), L1Transform(model, dt=0.3)).transform._complete()
 
