@@ -448,13 +448,13 @@ WRONG: dict[str, tuple[Sequence[str], dict[str, Any], type[Exception], str]] = {
         ("transform",),
         {"outside": [partial(FrameSkipTransform, 3)]},
         ValueError,
-        "steps again from a state from which it has stepped",
+        "stepped 3 times from one state before it came to the next",
     ),
     "frames skipped outside two": (
         ("transform",),
         {"outside": [partial(FrameSkipTransform, 3)], **two},
         ValueError,
-        "steps again from a state from which it has stepped",
+        "stepped 3 times from one state before it came to the next",
     ),
     "undeclared frame skip after": (
         ("transform",),

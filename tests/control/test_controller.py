@@ -249,7 +249,7 @@ def test_without_disturbance_nothing_happens():
 def test_bounds_and_time_step_come_from_the_environment_or_its_spec():
     def pushes(controller: L1Controller) -> tuple[torch.Tensor, torch.Tensor]:
         env = make_env(2, controller.make_primer())
-        strong = TensorDictModule(lambda x: 2.9 + 0 * x[..., :1], ["observation"], ["action"])
+        strong = TensorDictModule(lambda x: 5.0 + 0 * x[..., :1], ["observation"], ["action"])
         data = env.rollout(6, TensorDictSequential(strong, controller), break_when_any_done=False)
         env.close()
         return data["action"], data["l1", "q"]
@@ -270,7 +270,7 @@ def test_bounds_and_time_step_come_from_the_environment_or_its_spec():
         assert controller.config == expected
     for action, q in results[1:]:
         assert torch.equal(action, results[0][0]) and torch.equal(q, results[0][1])
-    assert results[0][0].max() == 3.0 or results[0][0].max() > 2.9
+    assert results[0][0].max() == 3.0
     free = L1Controller(make_model(), dt=0.04, action_low=-torch.inf, action_high=torch.inf)
     pushes(free)
     assert free.config.action_high == torch.inf
@@ -320,7 +320,7 @@ def test_random_frames_first():
     first, second = list(collector)
     collector.shutdown()
     # L1 starts where the policy does, within an episode.
-    assert not first["l1", "started"].any() and ("l1", "u_rl") not in first.keys(True)
+    assert not first["l1", "started"].any() and not first["next", "l1", "u_exec"].any()
     assert second["l1", "started"].any() and not second["l1", "started"][:, 0].any()
 
 
@@ -381,6 +381,7 @@ def test_ppo_has_a_ratio_of_one_for_an_unchanged_policy(kind):
     torch.testing.assert_close(result["loss_objective"], expected, atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.filterwarnings("ignore:No target network updater:UserWarning")
 @pytest.mark.parametrize("kind", ["controller", "transform"])
 def test_sac_replays_what_the_policy_chose(kind):
     controller, actor, data = collected(kind)

@@ -45,6 +45,11 @@ def skipping(frames: int) -> TransformedEnv:
     return TransformedEnv(pendulum(), Compose(StepCounter(), FrameSkipTransform(frames)))
 
 
+def vector_env(task: str) -> gymnasium.vector.VectorEnv:
+    mode = gymnasium.vector.AutoresetMode.DISABLED
+    return gymnasium.vector.SyncVectorEnv([partial(MujocoTaskEnv, task)], autoreset_mode=mode)
+
+
 @pytest.mark.parametrize(
     ("make", "expected"),
     [
@@ -54,7 +59,7 @@ def skipping(frames: int) -> TransformedEnv:
         (partial(skipping, 3), 0.15),
         (lambda: TransformedEnv(skipping(3), FrameSkipTransform(2), auto_unwrap=False), 0.3),
         (lambda: GymWrapper(Repeat(gymnasium.make("Pendulum-v1"), 2)), 0.1),
-        (lambda: GymWrapper(gymnasium.vector.SyncVectorEnv([MujocoTaskEnvOf("hopper")])), 0.008),
+        (lambda: GymWrapper(vector_env("hopper")), 0.008),
         (lambda: GymWrapper(MujocoTaskEnv("half_cheetah")), 0.05),
         (lambda: BatchedMujocoEnv("swimmer", 2), 0.04),
         (lambda: BatchedMujocoEnv(replace(TASKS["hopper"], frame_skip=8), 2), 0.016),
@@ -68,10 +73,6 @@ def test_time_step_of_environments(make, expected):
     found = time_step(env)
     assert found == (None if expected is None else pytest.approx(expected, rel=1e-6))
     env.close(raise_if_closed=False)
-
-
-def MujocoTaskEnvOf(task: str):
-    return partial(MujocoTaskEnv, task)
 
 
 def model(observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
@@ -91,7 +92,9 @@ def test_an_environment_that_does_not_tell():
     env = TransformedEnv(GymWrapper(Silent()), L1Transform(model))
     with pytest.raises(ValueError, match=r"L1Transform needs dt, .* the environment does not tell"):
         env.transform._complete()
-    TransformedEnv(GymWrapper(Silent()), L1Transform(model, dt=0.3)).transform._complete()
+    env = TransformedEnv(GymWrapper(Silent()), L1Transform(model, dt=0.3))
+    env.transform._complete()
+    assert env.transform.config.dt == 0.3
 
 
 @pytest.mark.parametrize(("dt", "agrees"), [(0.05, True), (0.0500001, True), (0.0501, False)])
