@@ -146,12 +146,13 @@ class Pipeline:
         inner: list = []
         outer: list = []
         self.events.append((inner, outer))
-        if self.face == "controller":
-            l1: list[Transform] = [self.controller.make_primer()]
-        else:
-            l1 = [L1Transform(model, **self.settings), Record(outer)]
         before, after = ([make() for make in makes] for makes in (self.before, self.after))
-        return TransformedEnv(self.base(), Compose(*before, Record(inner), *l1, *after))
+        if self.face == "controller":
+            chain = [*before, self.controller.make_primer(), *after, Record(inner)]
+        else:
+            l1 = L1Transform(model, **self.settings)
+            chain = [*before, Record(inner), l1, Record(outer), *after]
+        return TransformedEnv(self.base(), Compose(*chain))
 
     def collect(self, how: str) -> TensorDictBase:
         if how == "rollout":
@@ -169,7 +170,7 @@ class Pipeline:
             data = self.env.step(self.policy(data))
             steps.append(data.clone())
             data = self.env.step_mdp(data) if how == "env.step_mdp" else step_mdp(data)
-        return torch.stack(steps)
+        return torch.stack(steps, steps[0].ndim)
 
     def check(self, data: TensorDictBase, dt: float = 0.05) -> None:
         self.events = [pair for pair in self.events if pair[0]]
@@ -184,11 +185,6 @@ class Pipeline:
 
 def normaliser(**keys: Any) -> ObservationNorm:
     return ObservationNorm(5.0, 0.1, in_keys=["observation"], **keys)
-
-
-def raw_and_normalised() -> Compose:
-    copy = RenameTransform(["observation"], ["raw"], create_copy=True)
-    return Compose(copy, normaliser())
 
 
 def scaled_actor() -> TensorDictModule:
@@ -278,7 +274,7 @@ RIGHT: dict[str, tuple[Sequence[str], dict[str, Any]]] = {
 def test_right(name: str, face: str) -> None:
     pipeline = Pipeline(face, **RIGHT[name][1])
     pipeline.check(pipeline.collect("rollout"), 0.15 if "frames" in name else 0.05)
-    pipeline.env.close()
+    pipeline.env.close(raise_if_closed=False)
 
 
 @pytest.mark.parametrize("how", ["collector", "env.step_mdp", "step_mdp"])
@@ -287,7 +283,7 @@ def test_right(name: str, face: str) -> None:
 def test_right_in_other_loops(face: str, name: str, how: str) -> None:
     pipeline = Pipeline(face, **RIGHT[name][1])
     pipeline.check(pipeline.collect(how))
-    pipeline.env.close()
+    pipeline.env.close(raise_if_closed=False)
 
 
 @pytest.mark.parametrize("face", BOTH)
@@ -298,7 +294,8 @@ def test_a_selection_without_the_state_keeps_it_where_torchrl_does(face: str, ho
 
 
 def test_the_raw_observation_under_a_key_of_its_own() -> None:
-    pipeline = Pipeline(before=[raw_and_normalised], observation_key="raw", policy=actor("raw"))
+    copied = partial(RenameTransform, ["observation"], ["raw"], create_copy=True)
+    pipeline = Pipeline(before=[copied, normaliser], observation_key="raw", policy=actor("raw"))
     data = pipeline.collect("rollout")
     inner, outer = pipeline.events[0]
     raw = [("reset", data["raw"][0])]
@@ -451,13 +448,13 @@ WRONG: dict[str, tuple[Sequence[str], dict[str, Any], type[Exception], str]] = {
         ("transform",),
         {"outside": [partial(FrameSkipTransform, 3)]},
         ValueError,
-        "steps again from a state from which it has stepped",
+        "stepped 3 times from one state before it came to the next",
     ),
     "frames skipped outside two": (
         ("transform",),
         {"outside": [partial(FrameSkipTransform, 3)], **two},
         ValueError,
-        "steps again from a state from which it has stepped",
+        "stepped 3 times from one state before it came to the next",
     ),
     "undeclared frame skip after": (
         ("transform",),
@@ -553,7 +550,7 @@ WRONG: dict[str, tuple[Sequence[str], dict[str, Any], type[Exception], str]] = {
         BOTH,
         {"module": Zeroing([("l1", "q"), ("l1", "sigma_m")])},
         ValueError,
-        LOST.format("'q', 'sigma_m'"),
+        LOST.format(".*'sigma_m'"),
     ),
     "all forgotten by the policy": (
         ("transform",),
@@ -568,6 +565,7 @@ WRONG: dict[str, tuple[Sequence[str], dict[str, Any], type[Exception], str]] = {
 }
 
 
+@pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers:UserWarning")
 @pytest.mark.parametrize(
     ("name", "face"), [(name, face) for name, (faces, *_) in WRONG.items() for face in faces]
 )

@@ -135,6 +135,7 @@ class L1Transform(Transform):
         self._step_function: StepFunction | None = None
         self._emitted: Emitted | None = None
         self._consumed: Tensor | None = None
+        self._repeats = 0
         self._lacking: list[str] | None = None
 
     @property
@@ -223,17 +224,22 @@ class L1Transform(Transform):
         return tensordict.set(self._pending, following)
 
     def _check_repeated(self, tensordict: TensorDictBase) -> None:
-        """Refuse a second step from one state, as a FrameSkipTransform around takes."""
-        seal, emitted = tensordict.get((self.key, SEAL), None), self._emitted
-        consumed, self._consumed = self._consumed, seal
-        if seal is None or emitted is None or consumed is None or seal is emitted.seal:
+        """Refuse to go on where each step was taken twice, as by a FrameSkipTransform around."""
+        seal, emitted, consumed = tensordict.get((self.key, SEAL)), self._emitted, self._consumed
+        if emitted is None or not self._is_stateful:
             return
-        again = seal is consumed or (seal.shape == consumed.shape and torch.equal(seal, consumed))
-        if again and self._is_stateful and not torch.equal(seal, emitted.seal):
-            raise ValueError(
-                "L1Transform steps again from a state from which it has stepped: put what repeats "
-                "the action, such as FrameSkipTransform, before it in Compose"
-            )
+        if seal is emitted.seal or _equal(seal, emitted.seal):
+            if self._repeats:
+                raise ValueError(
+                    f"L1Transform stepped {self._repeats + 1} times from one state before it came "
+                    "to the next: put what repeats the action, such as FrameSkipTransform, before "
+                    "it in Compose"
+                )
+            self._consumed = seal if seal is emitted.seal else seal.clone()
+        elif consumed is not None and _equal(seal, consumed):
+            self._repeats += 1
+        else:
+            self._consumed, self._repeats = seal.clone(), 0
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         following = tensordict.get(self._pending)
@@ -249,6 +255,7 @@ class L1Transform(Transform):
     ) -> TensorDictBase:
         # Partial resets are merged by the environment, which discards the rows not reset.
         self._complete()
+        self._repeats = 0
         observation = tensordict_reset.get(self.observation_key)
         self._check_finite(observation, tensordict.get("_reset", None))
         return tensordict_reset.set(self.key, self._fresh(tensordict_reset))
@@ -354,3 +361,7 @@ class L1Transform(Transform):
             "_lacking": None,
         }
         return super().__getstate__() | empty
+
+
+def _equal(one: Tensor, other: Tensor) -> bool:
+    return one.shape == other.shape and torch.equal(one, other)
