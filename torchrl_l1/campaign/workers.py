@@ -19,6 +19,8 @@ from torchrl_l1.experiment.files import refuse_link
 # A process that found another one at its work; EX_TEMPFAIL, a name that Windows does not have.
 TEMPORARY_FAILURE = 75
 POLL_SECONDS = 0.1
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
+_STOPPING = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
 GRACE_SECONDS = 10.0
 _LAST_LINES = 15
 
@@ -114,7 +116,7 @@ class Workers:
             the jobs that ended badly; the others went on.
 
         Raises:
-            Stopped: after SIGINT or SIGTERM, once every process has ended.
+            Stopped: after SIGINT, SIGTERM, SIGHUP or SIGUSR1, once every process has ended.
         """
         self._queue.extend(jobs)
         with self._signals():
@@ -198,7 +200,7 @@ class Workers:
         def note(signal_number: int, frame: FrameType | None) -> None:
             self._stop = signal_number
 
-        before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+        before = {number: signal.signal(number, note) for number in _STOPPING}
         try:
             yield
         finally:

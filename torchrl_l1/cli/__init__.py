@@ -33,6 +33,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     if rest and options.command != "run" and not overridden:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     # Imports wait until the arguments are known to be right: torch takes seconds to load.
+    from torchrl_l1.experiment.signals import orderly_end
+
+    with orderly_end():
+        _dispatch(options, rest)
+
+
+def _dispatch(options: argparse.Namespace, rest: list[str]) -> None:
     from torchrl_l1.experiment.errors import USER_ERRORS, message
 
     try:

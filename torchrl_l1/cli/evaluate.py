@@ -146,7 +146,14 @@ def _check_one_study(runs: Sequence[TrainedRun]) -> None:
     """Runs may differ in their seed and in nothing that matters."""
 
     def settings(trained: TrainedRun) -> RunSettings:
-        return replace(trained.recipe, seed=0, run_dir="", resume=False, wandb=WandbSettings())
+        return replace(
+            trained.recipe,
+            seed=0,
+            run_dir="",
+            resume=False,
+            wandb=WandbSettings(),
+            on_divergence="stop",
+        )
 
     for trained in runs[1:]:
         if settings(trained) != settings(runs[0]):

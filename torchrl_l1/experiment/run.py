@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import sys
 from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
@@ -16,10 +17,13 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_l1.algorithms import Algorithm
+from torchrl_l1.algorithms.algorithm import Diverged, IterationResult
 from torchrl_l1.experiment.checkpoints import checkpoint_of, load_state
-from torchrl_l1.experiment.files import refuse_link
+from torchrl_l1.experiment.errors import RunDirectoryError
+from torchrl_l1.experiment.files import refuse_link, write_atomically
 from torchrl_l1.experiment.run_directory import RunDirectory, versions
 from torchrl_l1.experiment.settings import RunSettings, check_known
+from torchrl_l1.experiment.signals import RESUME_ME, asked_to_make_room
 
 MODES = ("auto", "online", "offline", "disabled")
 
@@ -157,17 +161,44 @@ def _run(
         if rows:
             # A kill may have come between the last checkpoint and its log entry.
             tracker.log(rows[-1], timings[-1])
-        for result in algorithm.iterate():
-            rows.append(result.metrics)
-            timings.append({"iteration": result.metrics["iteration"], **result.seconds})
-            directory.save_checkpoint(
-                checkpoint_of(algorithm.state_dict(), rows, timings, settings)
-            )
-            directory.write_results(algorithm.weights(), rows, timings)
-            tracker.log(rows[-1], timings[-1])
-            progress.update()
-            progress.write(
-                f"iteration {len(rows) - 1}: {result.metrics['real_steps']} real steps, "
-                f"return {result.metrics['return_mean']:.2f} "
-                f"(deterministic {result.metrics['return_deterministic']:.2f})"
-            )
+        try:
+            for result in algorithm.iterate():
+                _save(result, algorithm, settings, directory, rows, timings)
+                tracker.log(rows[-1], timings[-1])
+                progress.update()
+                progress.write(
+                    f"iteration {len(rows) - 1}: {result.metrics['real_steps']} real steps, "
+                    f"return {result.metrics['return_mean']:.2f} "
+                    f"(deterministic {result.metrics['return_deterministic']:.2f})"
+                )
+                for error in result.diverged:
+                    progress.write(f"on_divergence=warn: {error}")
+                if asked_to_make_room() and len(rows) < recipe.outer_iterations:
+                    progress.write(f"{directory.path}: saved; go on with --resume")
+                    sys.exit(RESUME_ME)
+        except Diverged as error:
+            directory.mark_diverged(str(error), rows)
+            raise RunDirectoryError(
+                f"{directory.path}: {error}; the checkpoint of {len(rows)} iterations stays, and "
+                "on_divergence=warn goes on all the same"
+            ) from error
+
+
+def _save(
+    result: IterationResult,
+    algorithm: Algorithm,
+    settings: dict[str, Any],
+    directory: RunDirectory,
+    rows: list[dict[str, Any]],
+    timings: list[dict[str, Any]],
+) -> None:
+    """Write what an outer iteration has led to."""
+    marks = {"diverged": len(result.diverged)} if result.diverged else {}
+    rows.append({**result.metrics, **marks})
+    timings.append({"iteration": result.metrics["iteration"], **result.seconds})
+    directory.save_checkpoint(checkpoint_of(algorithm.state_dict(), rows, timings, settings))
+    directory.write_results(algorithm.weights(), rows, timings)
+    if result.diverged:
+        write_atomically(directory.diverged_file, f"{result.diverged[0]}\n")
+    elif not any("diverged" in row for row in rows):
+        directory.diverged_file.unlink(missing_ok=True)

@@ -117,6 +117,7 @@ class RunDirectory:
         self.metrics_file = self.path / "metrics.csv"
         self.timing_file = self.path / "timing.csv"
         self.checksums_file = self.path / "checksums.json"
+        self.diverged_file = self.path / "diverged.txt"
         # Whether the last checkpoint may take the place of the one before it.
         self.last_is_good = True
 
@@ -348,6 +349,19 @@ class RunDirectory:
                 write_atomically(file, content)
                 restored.append(file.name)
         return restored
+
+    def mark_diverged(self, line: str, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Say that the run has stopped after these rows, the last of which gets a mark."""
+        write_atomically(self.diverged_file, line + "\n")
+        if not rows:
+            return
+        text = table_text([*rows[:-1], {**rows[-1], "diverged": 1}])
+        checksums = self._checksums()
+        known = checksums.get(self.metrics_file.name)
+        known = known if isinstance(known, dict) else {}
+        checksums[self.metrics_file.name] = {**known, str(len(rows)): digest(text)}
+        write_atomically(self.checksums_file, json.dumps(checksums, indent=2))
+        write_atomically(self.metrics_file, text)
 
     def _results(
         self,

@@ -107,6 +107,7 @@ class RunSettings(ABC):
         threads: CPU threads of torch.
         device: ``cpu``, ``cuda`` or ``auto`` (CUDA where there is one).
         horizon: steps per real episode; the task's own if null.
+        on_divergence: ``stop`` or ``warn`` where losses, weights or plans are no longer finite.
         l1: see :class:`L1Settings`.
         perturbation: noise and disturbances of the real environment.
         wandb: see :class:`WandbSettings`.
@@ -122,6 +123,7 @@ class RunSettings(ABC):
     threads: int = 1
     device: str = "cpu"
     horizon: int | None = None
+    on_divergence: str = "stop"
     l1: L1Settings = field(default_factory=L1Settings)
     perturbation: Perturbation = field(default_factory=Perturbation)
     wandb: WandbSettings = field(default_factory=WandbSettings)
@@ -147,6 +149,7 @@ class RunSettings(ABC):
         check_choice("device", self.device, DEVICES)
         check_count("threads", self.threads)
         check_optional_count("horizon", self.horizon)
+        check_choice("on_divergence", self.on_divergence, ("stop", "warn"))
 
     @abstractmethod
     def collected_episodes(self, iterations: int) -> int:
@@ -163,7 +166,7 @@ class RunSettings(ABC):
             ValueError: if settings contradict each other.
         """
         config = self.builds.config_class
-        return self.builds(
+        algorithm = self.builds(
             self.task,
             config(**{part.name: getattr(self, part.name) for part in fields(config)}),
             l1_config(self.l1, self.task),
@@ -173,13 +176,15 @@ class RunSettings(ABC):
             device=self.device,
             compile_l1=check_mode(self.l1.compile, "l1.compile"),
         )
+        algorithm.stops_on_divergence = self.on_divergence == "stop"
+        return algorithm
 
 
 # Not in ``register``: launchers resolve it in processes of their own.
 OmegaConf.register_new_resolver("bounded", bounded_overrides, replace=True)
 
 # Keys that may differ between a run and its continuation: they do not touch the result.
-VOLATILE_KEYS = ("run_dir", "resume", "wandb")
+VOLATILE_KEYS = ("run_dir", "resume", "wandb", "on_divergence")
 
 
 def flatten(node: Any, prefix: str = "") -> dict[str, Any]:

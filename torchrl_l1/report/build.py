@@ -106,6 +106,9 @@ def _introduction(page: Page, every: Sequence[Study], found: Findings, command: 
             "Left out, since another run has the same settings and seed (what it was evaluated in "
             f"and the other was not counts for the other):\n\n{left_out}"
         )
+    diverged = "\n".join(f"- {plain(r.path)}: {plain(r.diverged)}" for r in runs if r.diverged)
+    if diverged:
+        page.text(f"Trainings that diverged:\n\n{diverged}")
     if found.errors:
         errors = "\n".join(f"- {plain(error)}" for error in found.errors)
         page.text(f"Left out, since they cannot be read:\n\n{errors}")

@@ -14,6 +14,7 @@ import numpy as np
 
 from torchrl_l1.algorithms.facts import MEASURING, WINDOW
 from torchrl_l1.experiment.errors import RunDirectoryError, message
+from torchrl_l1.experiment.files import read_text
 from torchrl_l1.experiment.run_directory import RunDirectory, run_directories
 from torchrl_l1.report.identity import Identity, facts, identify
 from torchrl_l1.report.reading import (
@@ -54,6 +55,7 @@ class Run:
         evaluations: by name of the evaluation.
         stage: number ``(T,)`` of the stage that each outer iteration belongs to, from 1; ``None``
             where the algorithm has one only.
+        diverged: what is no longer finite in its training; empty if all is well.
     """
 
     path: Path
@@ -66,6 +68,7 @@ class Run:
     versions: dict[str, str] = field(default_factory=dict)
     evaluations: dict[str, list[Evaluation]] = field(default_factory=dict)
     stage: np.ndarray | None = None
+    diverged: str = ""
 
     @property
     def finished(self) -> bool:
@@ -207,6 +210,13 @@ def _read_table(file: Path) -> list[Evaluation]:
     return read_evaluations(file)
 
 
+def _diverged(file: Path) -> str:
+    try:
+        return read_text(file, 10_000).strip() if file.exists() else ""
+    except (OSError, ValueError) as error:
+        raise RunDirectoryError(f"cannot read {file}: {error}") from error
+
+
 def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirectoryError]) -> Run:
     try:
         identity = identify(config)
@@ -250,4 +260,5 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
         readable(partial(read_versions, path / "versions.json"), {}),
         {k: distinct_policies(tests, algorithm) for k, tests in evaluations.items() if tests},
         columns.get("stage"),
+        readable(partial(_diverged, directory.diverged_file), ""),
     )
