@@ -24,7 +24,12 @@ if TYPE_CHECKING:
         L1State,
         L1Transform,
     )
-    from torchrl_l1.dynamics import EnsembleDynamics, EnsembleDynamicsLoss, EnsembleModelEnv
+    from torchrl_l1.dynamics import (
+        EnsembleDynamics,
+        EnsembleDynamicsLoss,
+        EnsembleModelEnv,
+        fit_dynamics,
+    )
     from torchrl_l1.envs import BatchedMujocoEnv, make_env
     from torchrl_l1.planning import (
         CEMConfig,
@@ -55,6 +60,7 @@ __all__ = [
     "ShootingConfig",
     "TrajectorySampler",
     "__version__",
+    "fit_dynamics",
     "make_env",
 ]
 

@@ -169,9 +169,11 @@ def test_gradient_steps_are_bounded_and_best_weights_are_kept() -> None:
 
 
 def test_nothing_to_validate_on_is_an_error() -> None:
+    with pytest.raises(ValueError, match="1 training and 0 validation"):
+        fitted("action", FitConfig(), transitions(10)[1:2])
     data = transitions(10)
-    data["validation"][:] = False
-    with pytest.raises(ValueError, match="0 validation"):
+    data["validation"][:] = True
+    with pytest.raises(ValueError, match="0 training and 10 validation"):
         fitted("action", FitConfig(), data)
 
 

@@ -8,12 +8,15 @@ from torchrl_l1.dynamics.fit import (
     FitConfig,
     FitReport,
     evaluate_members,
+    fit_dynamics,
     fit_ensemble,
 )
 from torchrl_l1.dynamics.heads import HEADS, DeterministicHead, GaussianHead, Head, make_head
 from torchrl_l1.dynamics.imagination import EnsembleModelEnv, EnsembleWorldModel, imagine
 from torchrl_l1.dynamics.model import EnsembleDynamics
 from torchrl_l1.dynamics.normalizer import DataBox, Normalizer
+from torchrl_l1.dynamics.quality import FitQuality, measure_quality
+from torchrl_l1.dynamics.transitions import Transitions, read_transitions
 
 __all__ = [
     "HEADS",
@@ -27,14 +30,19 @@ __all__ = [
     "EnsembleModelEnv",
     "EnsembleWorldModel",
     "FitConfig",
+    "FitQuality",
     "FitReport",
     "GaussianHead",
     "Head",
     "Normalizer",
+    "Transitions",
     "evaluate_members",
+    "fit_dynamics",
     "fit_ensemble",
     "imagine",
     "make_dynamics",
     "make_head",
     "matched_hidden",
+    "measure_quality",
+    "read_transitions",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +14,9 @@ from torchrl_l1.dynamics.ensemble import EnsembleMLP
 from torchrl_l1.dynamics.heads import DeterministicHead, Head
 from torchrl_l1.dynamics.normalizer import DataBox, Normalizer
 from torchrl_l1.dynamics.residuals import Residuals
+
+if TYPE_CHECKING:
+    from torchrl_l1.dynamics.quality import FitQuality
 
 
 class EnsembleDynamics(nn.Module):
@@ -42,6 +45,8 @@ class EnsembleDynamics(nn.Module):
             the action, which their networks then do not read: a :class:`ControlAffineDynamics`.
             Planning networks and fits go by it.
         residuals: covariance of the one-step residuals, measured at each fit.
+        quality: how good :func:`~torchrl_l1.dynamics.fit_dynamics` found the model; ``None`` for
+            others.
 
     Examples:
         >>> import torch
@@ -66,6 +71,7 @@ class EnsembleDynamics(nn.Module):
         head: Head | None = None,
     ) -> None:
         super().__init__()
+        self.quality: FitQuality | None = None
         self.observation_dim = observation_dim
         self.action_dim = action_dim
         self.head: Head = DeterministicHead() if head is None else head

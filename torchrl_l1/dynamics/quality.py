@@ -1,0 +1,146 @@
+"""How good a fitted model is, in the units of the plant."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchrl_l1.dynamics.model import EnsembleDynamics
+from torchrl_l1.dynamics.transitions import Transitions
+
+HORIZONS = (10, 50)
+"""Steps after which the open loop is compared with the plant."""
+
+# Open loops from more starting points would not change the figures.
+_MOST_STARTS = 2000
+
+
+@dataclass(frozen=True)
+class FitQuality:
+    """What a model misses of transitions that it was not trained on, per entry of the state.
+
+    Attributes:
+        names: of the entries, n of them.
+        units: theirs, empty where unknown.
+        spread: standard deviation of the entry in the data, in its unit.
+        change: standard deviation of its change in one step.
+        rmse: root mean square error of the prediction of one step.
+        explained: share of the variance of the change that the prediction explains: 1 is perfect,
+            0 as good as the mean, NaN for an entry that never changes.
+        open_loop: root mean square error after so many steps on the model's own predictions, with
+            the actions that were recorded; NaN where no trajectory kept out of training is so
+            long, infinite where the model diverges.
+        training: transitions trained on.
+        validation: transitions kept out of training.
+        dropped: rows of the data that were no transitions.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    spread: tuple[float, ...]
+    change: tuple[float, ...]
+    rmse: tuple[float, ...]
+    explained: tuple[float, ...]
+    open_loop: dict[int, tuple[float, ...]]
+    training: int
+    validation: int
+    dropped: int
+
+
+@torch.no_grad()
+def measure_quality(
+    dynamics: EnsembleDynamics,
+    transitions: Transitions,
+    names: Sequence[str] | None = None,
+    units: Sequence[str] | None = None,
+    horizons: Sequence[int] = HORIZONS,
+) -> FitQuality:
+    """The quality of a model on what of the transitions was kept out of training.
+
+    Args:
+        dynamics: the model.
+        transitions: see :func:`read_transitions`.
+        names: of the entries of the state; ``x[0]``, ``x[1]`` and so on if ``None``.
+        units: theirs, of the same number.
+        horizons: steps after which the open loop is compared with the plant.
+
+    Raises:
+        ValueError: if names or units are not as many as the entries.
+    """
+    n = dynamics.observation_dim
+    names, units = entry_names(n, names, units)
+    held_out = transitions.data[transitions.validation]
+    x, u = held_out["observation"], held_out["action"]
+    change = held_out["next", "observation"] - x
+    error = change - dynamics.mean_change(x, u)
+    total = change.double().var(0, correction=0)
+    explained = 1 - error.double().square().mean(0) / total
+    explained[total == 0] = math.nan
+    return FitQuality(
+        names=names,
+        units=units,
+        spread=_floats(x.double().std(0, correction=0)),
+        change=_floats(total.sqrt()),
+        rmse=_floats(_rms(error)),
+        explained=_floats(explained),
+        open_loop={h: _floats(open_loop_error(dynamics, transitions, h)) for h in horizons},
+        training=int((~transitions.validation).sum()),
+        validation=len(x),
+        dropped=transitions.dropped,
+    )
+
+
+@torch.no_grad()
+def open_loop_error(dynamics: EnsembleDynamics, transitions: Transitions, horizon: int) -> Tensor:
+    """Root mean square error after ``horizon`` steps on the model's own predictions: ``(n,)``.
+
+    From every row kept out of training that so many others follow, with the recorded actions. NaN
+    without one, infinite where a prediction is not finite.
+    """
+    data, held_out = transitions.data, transitions.validation
+    joined = (transitions.joined & held_out).long()
+    joined[:-1] *= held_out[1:]
+    # How many links in a row begin at each row.
+    ends = torch.cat([joined.new_zeros(1), joined.cumsum(0)])
+    last = len(joined) - horizon + 1
+    if last < 1:
+        return data["observation"].new_full((dynamics.observation_dim,), math.nan)
+    whole = ends[horizon - 1 : horizon - 1 + last] - ends[:last] == horizon - 1
+    starts = (whole & held_out[:last]).nonzero().squeeze(-1)
+    if not len(starts):
+        return data["observation"].new_full((dynamics.observation_dim,), math.nan)
+    starts = starts[:: math.ceil(len(starts) / _MOST_STARTS)]
+    x = data["observation"][starts]
+    for step in range(horizon):
+        x = x + dynamics.mean_change(x, data["action"][starts + step])
+    error = _rms(x - data["next", "observation"][starts + horizon - 1])
+    return error.nan_to_num(nan=math.inf, posinf=math.inf)
+
+
+def entry_names(
+    n: int, names: Sequence[str] | None, units: Sequence[str] | None
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names and units of so many entries.
+
+    Raises:
+        ValueError: if there are more or fewer.
+    """
+    for option, given in (("names", names), ("units", units)):
+        if given is not None and (isinstance(given, str) or len(given) != n):
+            raise ValueError(
+                f"{option} must hold one for each of the observation's {n} entries, got {given!r}"
+            )
+    plain = [f"x[{entry}]" for entry in range(n)]
+    return tuple(names if names is not None else plain), tuple(units or [""] * n)
+
+
+def _rms(error: Tensor) -> Tensor:
+    return error.double().square().mean(0).sqrt()
+
+
+def _floats(values: Tensor) -> tuple[float, ...]:
+    return tuple(values.tolist())
