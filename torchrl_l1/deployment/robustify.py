@@ -33,14 +33,11 @@ from torchrl_l1.deployment.learning import (
     target_switch_rate,
 )
 from torchrl_l1.deployment.policies import Policy, load_policy
-from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, make_dynamics
+from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, fit_dynamics, make_dynamics
 from torchrl_l1.experiment.run_directory import save_atomically, write_atomically
 
 PRESETS = ("robust", "paper")
 """Settings of L1 that a policy can be given, the default first."""
-
-POOR_FIT = 0.5
-"""Share of variance explained below which a model is too poor for L1 to be of use."""
 
 _FORMAT = 1
 _FILE, _MODEL = "controller.json", "model.pt"
@@ -56,7 +53,6 @@ class RobustController:
         model: the learned dynamics.
         configs: settings of L1 by preset, bounds of the action included.
         preset: the one that acts by default.
-        quality: of the model, by entry of the observation.
         origin: how policy and model are found or made again.
     """
 
@@ -65,7 +61,6 @@ class RobustController:
     model: EnsembleDynamics
     configs: dict[str, L1Config]
     preset: str = PRESETS[0]
-    quality: list[dict[str, float]] = field(default_factory=list)
     origin: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -157,8 +152,7 @@ class RobustController:
             **origin,
             "preset": self.preset,
             "configs": {name: asdict(config) for name, config in self.configs.items()},
-            "quality": self.quality,
-        }
+            }
         save_atomically(folder / _MODEL, self.model.state_dict())
         write_atomically(folder / _FILE, json.dumps(stored, indent=2) + "\n")
         return folder
@@ -210,7 +204,6 @@ class RobustController:
             model.eval(),
             {name: L1Config(**values) for name, values in stored["configs"].items()},
             stored["preset"],
-            stored["quality"],
             {"policy": policy if isinstance(policy, str) else None, **given,
              "model": stored["model"]},
         )  # fmt: skip
@@ -314,10 +307,12 @@ def robustify(
         with _bar("collect", "step", progress) as bar:
             bar.total = steps
             data = collect(source, acting, steps, environments, noise, seed, bar.update)
-        dynamics, quality = _fit(origin["model"], data, fit or FitConfig(), seed, progress)
+        with _bar("fit", "epoch", progress) as bar:
+            dynamics = fit_dynamics(
+                data, config=fit, seed=seed, on_epoch=lambda _: bar.update(), **(model or {})
+            )
     if progress is not False:
-        print(quality_table(quality))
-    _warn_if_poor(quality)
+        print(dynamics.quality)
     if epsilon is None:
         rate = target_switch_rate(n) if switch_rate is None else switch_rate
         epsilon, _ = epsilon_for(dynamics, data, rate)
@@ -325,5 +320,17 @@ def robustify(
     order = [preset, *(name for name in PRESETS if name != preset)]
     return RobustController(
         source, acting, dynamics, {name: configs[name] for name in reversed(order)},
-        preset, quality, origin,
+        preset, origin,
     )  # fmt: skip
+
+
+@contextmanager
+def _private_randomness() -> Iterator[None]:
+    """What is drawn inside leaves torch's global generator as it was."""
+    with torch.random.fork_rng(devices=[]):
+        yield
+
+
+def _bar(words: str, unit: str, progress: bool | None) -> tqdm:
+    disable = None if progress is None else not progress
+    return tqdm(desc=words, unit=unit, disable=disable)
