@@ -1,6 +1,7 @@
 """Learned models of the dynamics: batched ensembles, their training and their use."""
 
 from torchrl_l1.dynamics.control_affine import ControlAffineDynamics
+from torchrl_l1.dynamics.data import read_csv, read_minari, read_npz
 from torchrl_l1.dynamics.ensemble import EnsembleMLP
 from torchrl_l1.dynamics.factory import MODEL_FORMS, make_dynamics, matched_hidden
 from torchrl_l1.dynamics.fit import (
@@ -44,5 +45,8 @@ __all__ = [
     "make_head",
     "matched_hidden",
     "measure_quality",
+    "read_csv",
+    "read_minari",
+    "read_npz",
     "read_transitions",
 ]

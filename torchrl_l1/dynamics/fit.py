@@ -84,7 +84,7 @@ class FitConfig:
         resolve_precision(self.precision, name="fit.precision")
 
 
-FROM_SCRATCH = {"max_epochs": 200, "max_gradient_steps": 5000, "patience": 10, "batch_size": 256}
+FROM_SCRATCH = {"max_epochs": 200, "max_gradient_steps": 3000, "patience": 10, "batch_size": 256}
 """Settings of a :class:`FitConfig` for a model that is fitted once, by :func:`fit_dynamics`."""
 
 
@@ -283,14 +283,15 @@ def fit_dynamics(
         action_key: of what was sent to the actuators ``(..., m)``.
         names: of the entries of the observation, for the report.
         units: theirs.
-        config: how to fit; for one fit from scratch if ``None``.
+        config: how to fit; settings for one fit from scratch if ``None``: up to 3000 gradient
+            steps of 256 transitions.
         seed: of weights, shuffles and the trajectories kept out of training. The global random
             numbers stay as they are.
         device: of the model; the CPU if ``None``.
         on_epoch: called with the number of the finished epoch, for progress bars.
         settings: fields of :class:`FitConfig`, such as ``validation_fraction``, and arguments of
-            :func:`~torchrl_l1.dynamics.make_dynamics`, such as ``hidden``, ``members`` or
-            ``head``.
+            :func:`~torchrl_l1.dynamics.make_dynamics`, such as ``members``, ``head`` or
+            ``hidden``, here ``(128, 128)`` unless given.
 
     Returns:
         the model, in evaluation mode, with its :attr:`~EnsembleDynamics.quality`, which prints as
@@ -326,7 +327,7 @@ def fit_dynamics(
     entry_names(n, names, units)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        dynamics = make_dynamics(n, m, **settings).to(here)
+        dynamics = make_dynamics(n, m, **{"hidden": (128, 128), **settings}).to(here)
         optimizer = torch.optim.Adam(dynamics.parameters(), lr=config.learning_rate)
         fit_to_transitions(dynamics, transitions, config, optimizer, on_epoch)
     dynamics.quality = measure_quality(dynamics, transitions, names, units)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -312,6 +313,53 @@ class EnsembleDynamics(nn.Module):
     ) -> ResidualStatistics:
         """:meth:`residual_covariance`, as the L1 controller takes it."""
         return ResidualStatistics(self.residual_covariance(observation, action, source))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write weights, normalisers, head, elites, residual statistics and quality to one file.
+
+        The format is that of safetensors: tensors, and settings as JSON; nothing in it is run
+        when it is read. The file is there whole or not at all.
+
+        Args:
+            path: of the file, such as ``"model.safetensors"``; what is there is replaced.
+
+        Raises:
+            TypeError: for a class of model or head of one's own.
+
+        Examples:
+            >>> from tempfile import mkdtemp
+            >>> file = f"{mkdtemp()}/model.safetensors"
+            >>> model = EnsembleDynamics(4, 1, members=3, hidden=(16,))
+            >>> model.save(file)
+            >>> x, u = torch.randn(7, 4), torch.randn(7, 1)
+            >>> torch.equal(EnsembleDynamics.load(file)(x, u), model(x, u))
+            True
+        """
+        from torchrl_l1.dynamics.storage import save_dynamics
+
+        save_dynamics(self, path)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], device: torch.device | str = "cpu") -> Self:
+        """Read a model that :meth:`save` wrote, in evaluation mode.
+
+        Args:
+            path: of the file.
+            device: where the model is to be.
+
+        Returns:
+            the model, of the class that was saved; its predictions are equal bit for bit.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if the file is damaged, or holds something else.
+        """
+        from torchrl_l1.dynamics.storage import load_dynamics
+
+        loaded = load_dynamics(path, device)
+        if not isinstance(loaded, cls):
+            raise ValueError(f"{path} holds a {type(loaded).__name__}, no {cls.__name__}")
+        return loaded
 
     def _over_elites(self, per_member: Tensor) -> Tensor:
         """Mean of ``(E, ...)`` over the elites."""

@@ -12,11 +12,13 @@ from torch import Tensor
 from torchrl_l1.dynamics.model import EnsembleDynamics
 from torchrl_l1.dynamics.transitions import Transitions
 
-HORIZONS = (10, 50)
+HORIZONS = (2, 5, 10, 20, 50)
 """Steps after which the open loop is compared with the plant."""
 
+_SHOWN = (10, 50)
+
 # Open loops from more starting points would not change the figures.
-_MOST_STARTS = 2000
+_MOST_STARTS = 500
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,41 @@ class FitQuality:
     training: int
     validation: int
     dropped: int
+
+    def __str__(self) -> str:
+        """A table, one line per entry."""
+        loops = {steps: self.open_loop[steps] for steps in _SHOWN if steps in self.open_loop}
+        after = [f"after {steps} steps" for steps in loops]
+        lines = [["entry", "unit", "spread", "change", "one step", "explained", *after]]
+        for entry, name in enumerate(self.names):
+            of_entry = (self.spread, self.change, self.rmse)
+            errors = [_number(values[entry]) for values in (*of_entry, *loops.values())]
+            explained = self.explained[entry]
+            share = "constant" if math.isnan(explained) else f"{100 * explained:.2f} %"
+            lines.append([name, self.units[entry] or "-", *errors[:3], share, *errors[3:]])
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        table = [
+            "  ".join(
+                cell.ljust(width) if column < 2 else cell.rjust(width)
+                for column, (cell, width) in enumerate(zip(line, widths, strict=True))
+            ).rstrip()
+            for line in lines
+        ]
+        dropped = f", {self.dropped} dropped" if self.dropped else ""
+        head = (
+            f"{self.training} transitions trained on, {self.validation} kept out of training"
+            f"{dropped}"
+        )
+        notes = [
+            "spread, change: standard deviations of the entry and of its change in one step; "
+            "others: root mean square errors"
+        ]
+        notes += [
+            f"no trajectory kept out of training has {steps} steps"
+            for steps, errors in loops.items()
+            if all(map(math.isnan, errors))
+        ]
+        return "\n".join([head, *table, *notes])
 
 
 @torch.no_grad()
@@ -144,3 +181,9 @@ def _rms(error: Tensor) -> Tensor:
 
 def _floats(values: Tensor) -> tuple[float, ...]:
     return tuple(values.tolist())
+
+
+def _number(value: float) -> str:
+    if math.isnan(value):
+        return "-"
+    return "diverges" if math.isinf(value) else f"{value:.3g}"

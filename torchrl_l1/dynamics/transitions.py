@@ -312,13 +312,13 @@ def _nothing() -> Transitions:
 def _hold_out(groups: Tensor, fraction: float, seed: int) -> Tensor:
     """Which rows are kept out of training, ``(N,)``, whole groups of them."""
     count = len(groups)
-    wanted = max(1, round(fraction * count))
+    wanted = max(1, min(round(fraction * count), count - 1))
     groups, sizes = groups.unique(return_inverse=True, return_counts=True)[1:]
     if count and int(sizes.max()) > wanted:
         order = groups.argsort(stable=True)
         rank = torch.arange(count, device=groups.device)
         rank[order] = rank - (sizes.cumsum(0) - sizes)[groups[order]]
-        piece = min(wanted, max(_PIECE, wanted // 5))
+        piece = max(1, min(wanted, count - wanted, max(_PIECE, wanted // 5)))
         pieces = groups * (count // piece + 1) + rank // piece
         groups, sizes = pieces.unique(return_inverse=True, return_counts=True)[1:]
     generator = torch.Generator().manual_seed(seed)
