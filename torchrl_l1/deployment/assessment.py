@@ -97,9 +97,7 @@ def run_episodes(
     env.set_seed(stream_seed(seed, "evaluate") % 2**31)
     seed_streams(seed, "evaluate")
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        data = env.rollout(
-            most_steps, policy, break_when_any_done=False, break_when_all_done=True
-        )
+        data = env.rollout(most_steps, policy, break_when_any_done=False, break_when_all_done=True)
     env.close()
     return data
 

@@ -6,6 +6,7 @@ import importlib.util
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -59,11 +60,13 @@ class EnvironmentSource:
         name: by which :func:`environment_source` finds it again; empty for a function.
         build: makes one environment, as its library has it.
         task: where it is a task of ours.
+        renders: whether ``build`` takes Gymnasium's ``render_mode``.
     """
 
     name: str
-    build: Callable[[], EnvBase]
+    build: Callable[..., EnvBase]
     task: Task | None = None
+    renders: bool = False
 
     def one(self) -> EnvBase:
         """One environment with a vector ``observation`` and a vector ``action``, both float32."""
@@ -87,28 +90,45 @@ class EnvironmentSource:
         Raises:
             ValueError: for a disturbance that cannot act on it.
         """
-        given = dict(disturbances or {})
-        for name in given:
+        given = self._checked(disturbances or {})
+        if self.task is not None:
+            return make_env(self.task, count, extra_transforms=control, seed=seed, **given)
+        first = self._changed(given)
+        base = first if first.batch_size else SerialEnv(count, lambda: self._changed(given))
+        return _perturbed(base, given, control, seed)
+
+    def single(
+        self,
+        disturbances: Mapping[str, float] | None = None,
+        control: Sequence[Transform] = (),
+        seed: int | None = None,
+        **options: Any,
+    ) -> TransformedEnv:
+        """As :meth:`several`, one by itself, which a task of ours has as a batch of one.
+
+        Args:
+            disturbances: as there.
+            control: as there.
+            seed: as there.
+            **options: of what makes it, such as ``render_mode`` where it :attr:`renders`.
+        """
+        given = self._checked(disturbances or {})
+        if self.task is not None:
+            return make_env(self.task, 1, extra_transforms=control, seed=seed, **given)
+        return _perturbed(self._changed(given, **options), given, control, seed)
+
+    def _checked(self, disturbances: Mapping[str, float]) -> dict[str, float]:
+        for name in disturbances:
             if not self.takes(DISTURBANCES[name]):
                 raise ValueError(
                     f"{name} changes the plant, which needs a task of ours or one of Gymnasium's "
                     f"MuJoCo environments, not {self.name or 'a function'}: leave it out"
                 )
-        if self.task is not None:
-            return make_env(self.task, count, extra_transforms=control, seed=seed, **given)
-        plant = {name: given.pop(name) for name in list(given) if _of_plant(DISTURBANCES[name])}
-        first = self._changed(plant)
-        if first.batch_size.numel() == 1 and not first.batch_size:
-            base: EnvBase = SerialEnv(count, lambda: self._changed(plant))
-        else:
-            base = first
-        env = TransformedEnv(base, Compose(*disturbance_transforms(**given), *control))
-        if seed is not None:
-            env.set_seed(seed % 2**31)
-        return env
+        return dict(disturbances)
 
-    def _changed(self, plant: Mapping[str, float]) -> EnvBase:
-        env = self.one()
+    def _changed(self, disturbances: Mapping[str, float], **options: Any) -> EnvBase:
+        env = vector_environment(self.build(**options))
+        plant = {name: v for name, v in disturbances.items() if _of_plant(DISTURBANCES[name])}
         if plant:
             simulation = simulation_of(env)
             simulation.model = disturbed_model(simulation.model, plant)
@@ -124,6 +144,19 @@ class EnvironmentSource:
     def time_step(self) -> float | None:
         """Time of one environment step in seconds, as far as the environment tells."""
         return self.task.dt if self.task is not None else time_step(self.build())
+
+
+def _perturbed(
+    base: EnvBase,
+    disturbances: Mapping[str, float],
+    control: Sequence[Transform],
+    seed: int | None,
+) -> TransformedEnv:
+    given = {name: v for name, v in disturbances.items() if not _of_plant(DISTURBANCES[name])}
+    env = TransformedEnv(base, Compose(*disturbance_transforms(**given), *control))
+    if seed is not None:
+        env.set_seed(seed % 2**31)
+    return env
 
 
 def _of_plant(disturbance: Disturbance) -> bool:
@@ -174,7 +207,7 @@ def environment_source(env: MakeEnv) -> EnvironmentSource:
 
 
 def _of_task(name: str, task: Task) -> EnvironmentSource:
-    return EnvironmentSource(name, lambda: BatchedMujocoEnv(task, 1), task)
+    return EnvironmentSource(name, partial(BatchedMujocoEnv, task, 1), task)
 
 
 def _of_gymnasium(name: str, gymnasium_id: str) -> EnvironmentSource:
@@ -183,15 +216,18 @@ def _of_gymnasium(name: str, gymnasium_id: str) -> EnvironmentSource:
     except (gymnasium.error.Error, ImportError) as error:
         raise ValueError(f"{name}: {error}; names are {_FORMS}") from None
     # TorchRL looks names up in a list that has no packages in it.
-    return EnvironmentSource(name, lambda: GymEnv(gymnasium_id.partition(":")[2] or gymnasium_id))
+    plain = gymnasium_id.partition(":")[2] or gymnasium_id
+    return EnvironmentSource(name, partial(GymEnv, plain), renders=True)
 
 
 def _of_dm_control(name: str, rest: str) -> EnvironmentSource:
     domain, _, task = rest.partition("/")
     if not task:
-        raise ValueError(f"{name}: write dm_control/DOMAIN/TASK, such as dm_control/cartpole/balance")
+        raise ValueError(
+            f"{name}: write dm_control/DOMAIN/TASK, such as dm_control/cartpole/balance"
+        )
     require("dm_control", "dm_control")
-    return EnvironmentSource(name, lambda: DMControlEnv(domain, task))
+    return EnvironmentSource(name, partial(DMControlEnv, domain, task))
 
 
 def require(module: str, extra: str) -> ModuleType:

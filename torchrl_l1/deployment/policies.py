@@ -31,9 +31,7 @@ NO_NORMALIZATION = "none"
 
 _STATISTICS = "vecnormalize.pkl"
 
-_FORMS = (
-    "sb3:FILE.zip, torchscript:FILE, onnx:FILE, MODULE:NAME, FILE.py:NAME, or a run directory"
-)
+_FORMS = "sb3:FILE.zip, torchscript:FILE, onnx:FILE, MODULE:NAME, FILE.py:NAME, or a run directory"
 
 
 class FunctionPolicy(TensorDictModuleBase):
@@ -205,7 +203,9 @@ def load_policy(
         found = StableBaselinesPolicy(found.policy)  # a model of Stable-Baselines3
     if weights is not None:
         if not isinstance(found, nn.Module):
-            raise ValueError(f"weights go into a module, and the policy is a {type(found).__name__}")
+            raise ValueError(
+                f"weights go into a module, and the policy is a {type(found).__name__}"
+            )
         found.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
     if isinstance(found, TensorDictModuleBase):
         return found
@@ -309,8 +309,9 @@ def _algorithm(home: str) -> Any:
     if package in ("stable_baselines3", "sb3_contrib") and inner[0] != "common":
         algorithms = import_module(f"{package}.{inner[0]}")
         return next(
-            value for name, value in vars(algorithms).items() if name.lower() == inner[0].lower()
-            and inspect.isclass(value)
+            value
+            for name, value in vars(algorithms).items()
+            if name.lower() == inner[0].lower() and inspect.isclass(value)
         )
     # Of algorithms whose policies are the common ones the class makes no difference.
     return import_module("stable_baselines3").PPO

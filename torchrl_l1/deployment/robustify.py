@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import shutil
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, TransformedEnv
 from tqdm import tqdm
@@ -33,14 +32,26 @@ from torchrl_l1.deployment.learning import (
     target_switch_rate,
 )
 from torchrl_l1.deployment.policies import Policy, load_policy
-from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, fit_dynamics, make_dynamics
-from torchrl_l1.experiment.run_directory import save_atomically, write_atomically
+from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, fit_dynamics
+from torchrl_l1.experiment.evaluate import load_run
+from torchrl_l1.experiment.l1_options import OFF, closest_option, l1_option
+from torchrl_l1.experiment.run_directory import write_atomically
+from torchrl_l1.experiment.settings import l1_config
 
 PRESETS = ("robust", "paper")
 """Settings of L1 that a policy can be given, the default first."""
 
+MODEL: Mapping[str, Any] = {"hidden": (128, 128)}
+"""Arguments of :func:`~torchrl_l1.dynamics.make_dynamics` where none are given."""
+
+FIT = FitConfig(max_epochs=200, max_gradient_steps=2000, patience=10, batch_size=256)
+"""How the model is fitted where nothing else is said."""
+
+POOR_FIT = 0.5
+"""Share of the variance of an entry's change below which a model explains too little of it."""
+
 _FORMAT = 1
-_FILE, _MODEL = "controller.json", "model.pt"
+_FILE, _MODEL = "controller.json", "model.safetensors"
 
 
 @dataclass
@@ -53,7 +64,7 @@ class RobustController:
         model: the learned dynamics.
         configs: settings of L1 by preset, bounds of the action included.
         preset: the one that acts by default.
-        origin: how policy and model are found or made again.
+        origin: how the policy is found again.
     """
 
     source: EnvironmentSource
@@ -78,13 +89,18 @@ class RobustController:
         Returns:
             with an ``L1Transform`` as its last transform: ``env.rollout(1000, robust.policy)``.
         """
-        config = self._config(preset)
+        config = self.settings(preset)
         env = TransformedEnv(vector_environment(env))
         for transform in [*policy_transforms(self.policy), L1Transform(self.model, config)]:
             env.append_transform(transform)
         return env
 
-    def _config(self, preset: str | None) -> L1Config:
+    def settings(self, preset: str | None) -> L1Config:
+        """The settings of a preset; those that act by default if ``None``.
+
+        Raises:
+            ValueError: for a preset that there is not.
+        """
         name = self.preset if preset is None else preset
         check_choice("preset", name, tuple(self.configs))
         return self.configs[name]
@@ -152,8 +168,8 @@ class RobustController:
             **origin,
             "preset": self.preset,
             "configs": {name: asdict(config) for name, config in self.configs.items()},
-            }
-        save_atomically(folder / _MODEL, self.model.state_dict())
+        }
+        self.model.save(folder / _MODEL)
         write_atomically(folder / _FILE, json.dumps(stored, indent=2) + "\n")
         return folder
 
@@ -196,17 +212,14 @@ class RobustController:
         else:
             given = {"normalization": None, "weights": None}
         assert policy is not None
-        model = make_dynamics(**stored["model"])
-        model.load_state_dict(torch.load(folder / _MODEL, map_location="cpu", weights_only=True))
         return cls(
             source,
             load_policy(policy, source.one(), **given),
-            model.eval(),
+            EnsembleDynamics.load(folder / _MODEL),
             {name: L1Config(**values) for name, values in stored["configs"].items()},
             stored["preset"],
-            {"policy": policy if isinstance(policy, str) else None, **given,
-             "model": stored["model"]},
-        )  # fmt: skip
+            {"policy": policy if isinstance(policy, str) else None, **given},
+        )
 
 
 def _copied(file: Path, folder: Path) -> str:
@@ -296,12 +309,10 @@ def robustify(
         )
     acting = load_policy(policy, env, normalization, weights)
     n = env.full_observation_spec["observation"].shape[-1]
-    m = env.full_action_spec["action"].shape[-1]
     origin = {
         "policy": policy if isinstance(policy, str) else None,
         "normalization": normalization,
         "weights": weights,
-        "model": {"observation_dim": n, "action_dim": m, **(model or {})},
     }
     with _private_randomness():
         with _bar("collect", "step", progress) as bar:
@@ -309,10 +320,12 @@ def robustify(
             data = collect(source, acting, steps, environments, noise, seed, bar.update)
         with _bar("fit", "epoch", progress) as bar:
             dynamics = fit_dynamics(
-                data, config=fit, seed=seed, on_epoch=lambda _: bar.update(), **(model or {})
-            )
+                data, config=fit or FIT, seed=seed, on_epoch=lambda _: bar.update(),
+                **{**MODEL, **(model or {})},
+            )  # fmt: skip
     if progress is not False:
         print(dynamics.quality)
+    _warn_if_poor(dynamics)
     if epsilon is None:
         rate = target_switch_rate(n) if switch_rate is None else switch_rate
         epsilon, _ = epsilon_for(dynamics, data, rate)
@@ -322,6 +335,77 @@ def robustify(
         source, acting, dynamics, {name: configs[name] for name in reversed(order)},
         preset, origin,
     )  # fmt: skip
+
+
+def load_target(
+    target: str,
+    policy: str | None = None,
+    normalization: str | None = None,
+    weights: str | None = None,
+) -> RobustController:
+    """What a command is about: a controller, a run, or a policy in its environment.
+
+    Args:
+        target: a folder that :func:`robustify`'s command or :meth:`RobustController.save` wrote, a
+            run directory, whose own model and settings count, or an environment by name.
+        policy: the policy in that environment, which then has no L1.
+        normalization: see :func:`load_policy`.
+        weights: likewise.
+
+    Raises:
+        ValueError: if it is none of them, or a policy is given beside a folder.
+    """
+    folder = Path(target)
+    if folder.is_dir():
+        if policy is not None:
+            raise ValueError(f"{target} has a policy of its own: leave --policy out")
+        for place in (folder, folder / "controller"):
+            if (place / _FILE).exists():
+                return RobustController.load(place)
+        return _of_run(folder)
+    if policy is None:
+        raise ValueError(
+            f"there is no folder {target}; give a controller, a run directory, or an environment "
+            "with --policy"
+        )
+    source = environment_source(target)
+    acting = load_policy(policy, source.one(), normalization, weights)
+    return RobustController(source, acting, EnsembleDynamics(1, 1, hidden=()), {}, OFF)
+
+
+def _of_run(folder: Path) -> RobustController:
+    """A training with its own model; with its own L1, where it has one of that kind."""
+    run = load_run(folder)
+    own, task = run.recipe.l1, run.recipe.task
+    configs = {}
+    for name in reversed(PRESETS):
+        settings = own
+        if closest_option(own, task) != name:
+            settings = replace(l1_option(name), epsilon=own.epsilon)
+        config = l1_config(settings, task)
+        assert config is not None
+        configs[name] = config
+    policy = list(run.algorithm.policies.values())[-1]
+    model = run.algorithm.acting_dynamics
+    origin = {"policy": str(folder)}
+    return RobustController(environment_source(task), policy, model, configs, origin=origin)
+
+
+def _warn_if_poor(model: EnsembleDynamics) -> None:
+    quality = model.quality
+    assert quality is not None
+    poor = [
+        f"{name} ({100 * share:.0f} %)"
+        for name, share in zip(quality.names, quality.explained, strict=True)
+        if share < POOR_FIT
+    ]
+    if poor:
+        warnings.warn(
+            f"the model explains little of how {', '.join(poor)} change in a step, and L1 takes "
+            "what it does not explain for a disturbance: collect more steps (--steps), with more "
+            "noise (--noise), or leave entries out that the action does not move",
+            stacklevel=3,
+        )
 
 
 @contextmanager
