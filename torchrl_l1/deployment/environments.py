@@ -153,7 +153,8 @@ def _perturbed(
     seed: int | None,
 ) -> TransformedEnv:
     given = {name: v for name, v in disturbances.items() if not _of_plant(DISTURBANCES[name])}
-    env = TransformedEnv(base, Compose(*disturbance_transforms(**given), *control))
+    chain = Compose(*disturbance_transforms(**given), *control)
+    env = TransformedEnv(base, chain, auto_unwrap=True)
     if seed is not None:
         env.set_seed(seed % 2**31)
     return env
@@ -211,12 +212,14 @@ def _of_task(name: str, task: Task) -> EnvironmentSource:
 
 
 def _of_gymnasium(name: str, gymnasium_id: str) -> EnvironmentSource:
+    package, colon, rest = gymnasium_id.partition(":")
     try:
-        gymnasium.spec(gymnasium_id)
+        if colon:  # of a package that registers it
+            import_module(package)
+        plain = rest if colon else gymnasium_id
+        gymnasium.spec(plain)
     except (gymnasium.error.Error, ImportError) as error:
         raise ValueError(f"{name}: {error}; names are {_FORMS}") from None
-    # TorchRL looks names up in a list that has no packages in it.
-    plain = gymnasium_id.partition(":")[2] or gymnasium_id
     return EnvironmentSource(name, partial(GymEnv, plain), renders=True)
 
 
@@ -316,7 +319,7 @@ def vector_environment(env: EnvBase) -> EnvBase:
     }
     if any(double.values()):
         transforms.append(DoubleToFloat(**double))
-    return TransformedEnv(env, Compose(*transforms)) if transforms else env
+    return TransformedEnv(env, Compose(*transforms), auto_unwrap=True) if transforms else env
 
 
 def _vectors(env: EnvBase) -> dict[str, TensorSpec]:

@@ -27,8 +27,9 @@ class Exploration(TensorDictModuleBase):
 
     Half of the noise is held for a number of steps that is drawn anew each time, ten in the mean:
     the model must know what an action does that is off for a while, as under a disturbance. The
-    other half is new in every step. Each row has a level of its own, from none to twice ``noise``,
-    so that some data are those of the policy itself. Actions stay within their bounds.
+    other half is new in every step. The level of both is drawn with the held part, between none and
+    twice ``noise``, so that some data are those of the policy itself. Actions stay within their
+    bounds.
 
     Args:
         policy: the policy.
@@ -49,17 +50,17 @@ class Exploration(TensorDictModuleBase):
         if self.low is not None and self.high is not None:
             range_ = self.high - self.low
             half = torch.where(range_.isfinite(), 0.5 * range_, 1.0)
-        rows = zero.shape[:-1]
-        level = torch.linspace(0.0, 2.0, max(rows.numel(), 2), dtype=zero.dtype)[: rows.numel()]
-        self.scale = noise * half * level.reshape(*rows, 1)
+        self.scale = noise * half
         self.held = torch.randn_like(zero)
+        self.level = 2 * torch.rand_like(zero[..., :1])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the policy's action with noise."""
         tensordict = self.policy(tensordict)
-        renewed = torch.rand(*self.held.shape[:-1], 1) < 1 / _MEAN_HOLD
+        renewed = torch.rand_like(self.level) < 1 / _MEAN_HOLD
         self.held = torch.where(renewed, torch.randn_like(self.held), self.held)
-        noise = 0.5**0.5 * (self.held + torch.randn_like(self.held))
+        self.level = torch.where(renewed, 2 * torch.rand_like(self.level), self.level)
+        noise = 0.5**0.5 * self.level * (self.held + torch.randn_like(self.held))
         action = tensordict.get("action") + self.scale * noise
         if self.low is not None:
             action = action.clamp(self.low, self.high)

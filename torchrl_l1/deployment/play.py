@@ -141,7 +141,8 @@ def side_by_side(films: Sequence[Film]) -> list[np.ndarray]:
 
     Examples:
         >>> black = [np.zeros((40, 60, 3), np.uint8)]
-        >>> frames = side_by_side([Film("L1 off", black, 1.0, True), Film("on", 3 * black, 3.0, False)])
+        >>> films = [Film("L1 off", black, 1.0, True), Film("L1 on", 3 * black, 3.0, False)]
+        >>> frames = side_by_side(films)
         >>> len(frames), frames[0].shape
         (3, (40, 120, 3))
     """

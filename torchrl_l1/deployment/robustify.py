@@ -90,7 +90,7 @@ class RobustController:
             with an ``L1Transform`` as its last transform: ``env.rollout(1000, robust.policy)``.
         """
         config = self.settings(preset)
-        env = TransformedEnv(vector_environment(env))
+        env = TransformedEnv(vector_environment(env), auto_unwrap=True)
         for transform in [*policy_transforms(self.policy), L1Transform(self.model, config)]:
             env.append_transform(transform)
         return env
@@ -300,21 +300,15 @@ def robustify(
     if dt is not None:
         check_positive("dt", dt)
     source = environment_source(make_env)
-    env = source.one()
     dt = source.time_step() if dt is None else dt
     if dt is None:
         raise ValueError(
             f"{source.name or 'the environment'} does not tell the time of its steps: give dt "
             "(--dt), in seconds"
         )
-    acting = load_policy(policy, env, normalization, weights)
-    n = env.full_observation_spec["observation"].shape[-1]
-    origin = {
-        "policy": policy if isinstance(policy, str) else None,
-        "normalization": normalization,
-        "weights": weights,
-    }
     with _private_randomness():
+        env = source.one()
+        acting = load_policy(policy, env, normalization, weights)
         with _bar("collect", "step", progress) as bar:
             bar.total = steps
             data = collect(source, acting, steps, environments, noise, seed, bar.update)
@@ -327,8 +321,14 @@ def robustify(
         print(dynamics.quality)
     _warn_if_poor(dynamics)
     if epsilon is None:
+        n = dynamics.observation_dim
         rate = target_switch_rate(n) if switch_rate is None else switch_rate
         epsilon, _ = epsilon_for(dynamics, data, rate)
+    origin = {
+        "policy": policy if isinstance(policy, str) else None,
+        "normalization": normalization,
+        "weights": weights,
+    }
     configs = {"robust": L1Config.robust(dt), "paper": L1Config.paper(dt, epsilon=epsilon)}
     order = [preset, *(name for name in PRESETS if name != preset)]
     return RobustController(
@@ -412,6 +412,7 @@ def _warn_if_poor(model: EnsembleDynamics) -> None:
 def _private_randomness() -> Iterator[None]:
     """What is drawn inside leaves torch's global generator as it was."""
     with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
         yield
 
 
