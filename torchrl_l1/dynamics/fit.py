@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from inspect import signature
@@ -84,7 +85,12 @@ class FitConfig:
         resolve_precision(self.precision, name="fit.precision")
 
 
-FROM_SCRATCH = {"max_epochs": 200, "max_gradient_steps": 3000, "patience": 10, "batch_size": 256}
+FROM_SCRATCH: dict[str, Any] = {
+    "max_epochs": 200,
+    "max_gradient_steps": 3000,
+    "patience": 10,
+    "batch_size": 256,
+}
 """Settings of a :class:`FitConfig` for a model that is fitted once, by :func:`fit_dynamics`."""
 
 
@@ -297,6 +303,10 @@ def fit_dynamics(
         the model, in evaluation mode, with its :attr:`~EnsembleDynamics.quality`, which prints as
         a table.
 
+    Warns:
+        UserWarning: if rows of the data are left out, or if the model is too poor for L1 to be of
+            use.
+
     Raises:
         KeyError: if the data lack a key.
         TypeError: for a setting that does not exist.
@@ -331,6 +341,8 @@ def fit_dynamics(
         optimizer = torch.optim.Adam(dynamics.parameters(), lr=config.learning_rate)
         fit_to_transitions(dynamics, transitions, config, optimizer, on_epoch)
     dynamics.quality = measure_quality(dynamics, transitions, names, units)
+    if dynamics.quality.warning:
+        warnings.warn(dynamics.quality.warning, stacklevel=2)
     return dynamics.eval()
 
 

@@ -17,6 +17,9 @@ HORIZONS = (2, 5, 10, 20, 50)
 
 _SHOWN = (10, 50)
 
+MOST_GAIN_SPREAD = 0.3
+"""Disagreement on the gain above which L1 was found to be of no use, see ``docs/data.md``."""
+
 # Open loops from more starting points would not change the figures.
 _MOST_STARTS = 500
 
@@ -36,6 +39,11 @@ class FitQuality:
         open_loop: root mean square error after so many steps on the model's own predictions, with
             the actions that were recorded; NaN where no trajectory kept out of training is so
             long, infinite where the model diverges.
+        gain_spread: how much the members of the ensemble disagree on what an action does to the
+            state: root mean square of their deviation from the mean gain, as a share of it. L1
+            acts by this gain.
+        input_error: root mean square of the input that would explain what the model misses, per
+            entry of the action, in its unit: what L1 sees of the model's errors and of noise.
         training: transitions trained on.
         validation: transitions kept out of training.
         dropped: rows of the data that were no transitions.
@@ -48,6 +56,8 @@ class FitQuality:
     rmse: tuple[float, ...]
     explained: tuple[float, ...]
     open_loop: dict[int, tuple[float, ...]]
+    gain_spread: float
+    input_error: tuple[float, ...]
     training: int
     validation: int
     dropped: int
@@ -85,7 +95,24 @@ class FitQuality:
             for steps, errors in loops.items()
             if all(map(math.isnan, errors))
         ]
-        return "\n".join([head, *table, *notes])
+        inputs = ", ".join(map(_number, self.input_error))
+        notes.append(
+            f"members differ by {100 * self.gain_spread:.1f} % in what the action does; "
+            f"errors and noise look like an input of {inputs}"
+        )
+        return "\n".join([head, *table, *notes, *([self.warning] if self.warning else [])])
+
+    @property
+    def warning(self) -> str:
+        """Why the model is too poor for L1 to be of use; empty if nothing says so."""
+        if not self.gain_spread > MOST_GAIN_SPREAD:
+            return ""
+        return (
+            "the model is too poor for L1: its members differ by "
+            f"{100 * self.gain_spread:.0f} % (more than {100 * MOST_GAIN_SPREAD:.0f} %) in what "
+            "the action does; record more data, with actions that vary on their own and not only "
+            "with the state"
+        )
 
 
 @torch.no_grad()
@@ -114,6 +141,9 @@ def measure_quality(
     x, u = held_out["observation"], held_out["action"]
     change = held_out["next", "observation"] - x
     error = change - dynamics.mean_change(x, u)
+    gains = member_gains(dynamics, x, u, transitions.data["action"].std(0, correction=0))
+    # As large as the model takes it for: the floor counts where an entry hardly moves.
+    scale = dynamics.change_normalizer.std.double()
     total = change.double().var(0, correction=0)
     explained = 1 - error.double().square().mean(0) / total
     explained[total == 0] = math.nan
@@ -125,6 +155,8 @@ def measure_quality(
         rmse=_floats(_rms(error)),
         explained=_floats(explained),
         open_loop={h: _floats(open_loop_error(dynamics, transitions, h)) for h in horizons},
+        gain_spread=_gain_spread(gains, scale),
+        input_error=_floats(_rms(_as_input(gains.mean(0), error, scale))),
         training=int((~transitions.validation).sum()),
         validation=len(x),
         dropped=transitions.dropped,
@@ -156,6 +188,42 @@ def open_loop_error(dynamics: EnsembleDynamics, transitions: Transitions, horizo
         x = x + dynamics.mean_change(x, data["action"][starts + step])
     error = _rms(x - data["next", "observation"][starts + horizon - 1])
     return error.nan_to_num(nan=math.inf, posinf=math.inf)
+
+
+def member_gains(dynamics: EnsembleDynamics, x: Tensor, u: Tensor, step: Tensor) -> Tensor:
+    """What an action does to the state in the eyes of every elite: ``(k, N, n, m)``.
+
+    By differences over a step ``(m,)`` of each entry of the action ``(N, m)`` either way: what
+    the data tell of, as the slope in a point does not.
+    """
+    step = step.clamp_min(1e-6)
+    sides = []
+    for entry in range(len(step)):
+        offset = torch.zeros_like(step)
+        offset[entry] = step[entry]
+        above, below = (dynamics.member_changes(x, u + side * offset) for side in (1, -1))
+        sides.append((above - below)[dynamics.elites] / (2 * step[entry]))
+    return torch.stack(sides, -1).double()
+
+
+def _gain_spread(gains: Tensor, scale: Tensor) -> float:
+    """Deviation of the members from their mean, of which entries of the state weigh alike."""
+    if gains.shape[0] < 2:
+        return math.nan
+    gains = gains / scale[:, None]
+    mean = gains.mean(0)
+    apart = (gains - mean).square().sum((-1, -2)).mean()
+    return float((apart / mean.square().sum((-1, -2)).mean()).sqrt())
+
+
+def _as_input(gain: Tensor, error: Tensor, scale: Tensor) -> Tensor:
+    """Inputs ``(N, m)`` that come closest to errors ``(N, n)``, entries of the state alike."""
+    matrix, right = gain / scale[:, None], (error.double() / scale)[..., None]
+    square = matrix.mT @ matrix
+    # An input without any effect explains nothing.
+    ridge = 1e-9 * square.diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(1e-30)
+    square = square + torch.diag_embed(ridge[:, None].expand(square.shape[:-1]))
+    return torch.linalg.solve(square, matrix.mT @ right)[..., 0]
 
 
 def entry_names(
