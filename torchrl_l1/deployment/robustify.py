@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -46,9 +45,6 @@ MODEL: Mapping[str, Any] = {"hidden": (128, 128)}
 
 FIT = FitConfig(max_epochs=200, max_gradient_steps=2000, patience=10, batch_size=256)
 """How the model is fitted where nothing else is said."""
-
-POOR_FIT = 0.5
-"""Share of the variance of an entry's change below which a model explains too little of it."""
 
 _FORMAT = 1
 _FILE, _MODEL = "controller.json", "model.safetensors"
@@ -319,7 +315,6 @@ def robustify(
             )  # fmt: skip
     if progress is not False:
         print(dynamics.quality)
-    _warn_if_poor(dynamics)
     if epsilon is None:
         n = dynamics.observation_dim
         rate = target_switch_rate(n) if switch_rate is None else switch_rate
@@ -389,23 +384,6 @@ def _of_run(folder: Path) -> RobustController:
     model = run.algorithm.acting_dynamics
     origin = {"policy": str(folder)}
     return RobustController(environment_source(task), policy, model, configs, origin=origin)
-
-
-def _warn_if_poor(model: EnsembleDynamics) -> None:
-    quality = model.quality
-    assert quality is not None
-    poor = [
-        f"{name} ({100 * share:.0f} %)"
-        for name, share in zip(quality.names, quality.explained, strict=True)
-        if share < POOR_FIT
-    ]
-    if poor:
-        warnings.warn(
-            f"the model explains little of how {', '.join(poor)} change in a step, and L1 takes "
-            "what it does not explain for a disturbance: collect more steps (--steps), with more "
-            "noise (--noise), or leave entries out that the action does not move",
-            stacklevel=3,
-        )
 
 
 @contextmanager
