@@ -15,7 +15,7 @@ MOST_FILES, MOST_LINES = 140, 500
 # Each may import from those before it.
 ORDER = (
     *("control", "dynamics", "envs", "objectives", "planning", "algorithms"),
-    *("experiment", "campaign", "report", "cli"),
+    *("experiment", "campaign", "report", "deployment", "cli"),
 )
 
 

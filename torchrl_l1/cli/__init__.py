@@ -1,4 +1,4 @@
-"""The command ``torchrl-l1``: run, campaign, evaluate, report, verify."""
+"""The command ``torchrl-l1``: run, campaign, evaluate, robustify, play, export, report, verify."""
 
 from __future__ import annotations
 
@@ -6,10 +6,32 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 
 DESCRIPTION = "Robust model-based reinforcement learning with L1 adaptive control."
 
 _TRUST = "let the file set up Hydra itself, which may run any code"
+
+
+_DEPLOYMENT = (
+    (
+        "robustify",
+        "put L1 around a policy of any origin, and test it under disturbances",
+        "Collects data with the policy, fits a model, calibrates L1, and tests the policy under "
+        "disturbances with L1 off and on and with an oracle.",
+    ),
+    (
+        "play",
+        "show a policy in a window or a film, with L1 off or on",
+        "Plays an episode of a run, of a robust controller or of a policy in its environment.",
+    ),
+    (
+        "export",
+        "write policy and L1 as one function of observation and state",
+        "Writes a robust controller as TorchScript, ONNX or an exported program of torch, and "
+        "compares it with the original on steps of the environment.",
+    ),
+)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -20,6 +42,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     _run_parser(commands)
     _campaign_parser(commands)
     _evaluate_parser(commands, asked="evaluate" in arguments[:1])
+    for name, words, description in _DEPLOYMENT:
+        parts = commands.add_parser(name, help=words, description=description)
+        # What their options come with is heavy; no other command should wait for it.
+        if name in arguments[:1]:
+            import_module(f"torchrl_l1.cli.{name}").add_arguments(parts)
     _report_parser(commands)
     verify = commands.add_parser(
         "verify", help="replay recorded traces of a reference controller in float64"
@@ -53,6 +80,9 @@ def _dispatch(options: argparse.Namespace, rest: list[str]) -> None:
             from torchrl_l1.cli.evaluate import evaluate_command
 
             evaluate_command(options)
+        elif options.command in [name for name, *_ in _DEPLOYMENT]:
+            chosen = import_module(f"torchrl_l1.cli.{options.command}")
+            getattr(chosen, f"{options.command}_command")(options)
         elif options.command == "report":
             from torchrl_l1.report.build import report_command
 
