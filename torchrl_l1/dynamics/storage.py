@@ -125,7 +125,9 @@ def _restored(
 def _quality(stored: dict[str, Any]) -> FitQuality:
     """JSON has lists for tuples, and strings for the keys of dictionaries."""
     loops = {int(steps): tuple(errors) for steps, errors in stored.pop("open_loop").items()}
-    plain = {name: tuple(v) if isinstance(v, list) else v for name, v in stored.items()}
+    plain: dict[str, Any] = {
+        name: tuple(v) if isinstance(v, list) else v for name, v in stored.items()
+    }
     return FitQuality(**plain, open_loop=loops)
 
 
@@ -133,7 +135,7 @@ def _digest(settings: str, tensors: Iterable[tuple[str, Tensor]]) -> str:
     digest = hashlib.sha256(settings.encode())
     for name, value in sorted(tensors):
         digest.update(name.encode())
-        digest.update(value.cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+        digest.update(value.cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
 
 

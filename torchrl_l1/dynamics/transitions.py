@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
@@ -12,7 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 
-Data = TensorDictBase | ReplayBuffer | Sequence[TensorDictBase]
+Data: TypeAlias = TensorDictBase | ReplayBuffer | Sequence[TensorDictBase]
 
 # Shorter pieces of a long trajectory would hold no open loop of 50 steps.
 _PIECE = 100
@@ -86,13 +87,13 @@ def read_transitions(
     read: list[TensorDict] = []
     trajectories = 0
     for part in _parts(data):
-        rows = _read(_time_last(part), observation_key, action_key, dtype, device)
-        rows["trajectory"] += trajectories
-        trajectories += len(rows)
-        read.append(rows)
+        one = _read(_time_last(part), observation_key, action_key, dtype, device)
+        one["trajectory"] += trajectories
+        trajectories += len(one)
+        read.append(one)
     if not read:
         return _nothing()
-    rows = torch.cat(read)
+    rows: TensorDictBase = TensorDict.cat(read)
     keep = rows["real"] & _is_transition(rows, (observation_key, action_key))
     kept = keep.nonzero().squeeze(-1)
     joined = rows["joined"][kept]
