@@ -46,8 +46,8 @@ METRICS = {f"metrics_{name}": name for name in SCHEMAS}
 def metrics_table(algorithm: str) -> str:
     """Every metric that an algorithm logs, as a Markdown table."""
     metrics = SCHEMAS[algorithm].builds.facts.metrics
-    rows = [{"Metric": f"`{name}`", "Meaning": meaning} for name, meaning in metrics.items()]
-    return f"{markdown(rows)}\n"
+    rows = [f"| `{name}` | {meaning} |" for name, meaning in metrics.items()]
+    return "\n".join(["| Metric | Meaning |", "|---|---|", *rows, ""])
 
 
 def api_page(package: str) -> str:

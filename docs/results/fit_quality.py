@@ -33,7 +33,7 @@ from torchrl.envs import Compose, GymEnv, SerialEnv, Transform, TransformedEnv
 from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.dynamics import EnsembleDynamics, fit_dynamics
 from torchrl_l1.envs import ActuatorBias, make_env
-from torchrl_l1.experiment.run_directory import write_table
+from torchrl_l1.experiment.files import write_table
 from torchrl_l1.report.page import markdown
 from torchrl_l1.report.style import color, grid, legend_below, save
 
