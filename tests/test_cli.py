@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import csv
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -105,3 +107,13 @@ def test_arguments_are_left_as_they_were() -> None:
     before = list(sys.argv)
     main([*RUN, "--cfg", "job"])
     assert sys.argv == before
+
+
+def test_a_closed_pipe_is_told_in_a_line() -> None:
+    command = [sys.executable, "-u", "-m", "torchrl_l1.cli", "recipes"]
+    read, write = os.pipe()
+    os.close(read)
+    ended = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True)
+    os.close(write)
+    assert ended.returncode == 1
+    assert ended.stderr == "torchrl-l1 recipes: what reads the output has ended\n"

@@ -223,6 +223,26 @@ def test_kill_while_copying_leaves_no_run_and_the_next_start_copies(
     assert not (this.directory.path / "rest").exists()
 
 
+def test_the_source_is_never_changed_through_links(
+    write: Callable[..., Path], first: PlannedRun, tmp_path: Path
+) -> None:
+    source, elsewhere = first.directory.path, tmp_path / "elsewhere"
+    (source / "evaluations").rename(elsewhere)
+    (source / "evaluations").symlink_to(elsewhere)
+    (source / "model.pt").rename(tmp_path / "model.pt")
+    (source / "model.pt").symlink_to(tmp_path / "model.pt")
+    (source / "wandb").symlink_to(tmp_path / "nowhere")
+    before = contents(elsewhere)
+    other = EVALUATION | {"name": "other"}
+    (this,) = planned(write("second", [0], evaluations=[other]), tmp_path / "second")
+    copy_run(source, this)
+    assert this.problem() is None
+    assert contents(elsewhere) == before and (tmp_path / "model.pt").exists()
+    copied = list(this.directory.path.rglob("*"))
+    assert copied and not any(path.is_symlink() for path in copied)
+    assert (source / "evaluations").is_symlink()
+
+
 def test_run_that_changes_while_it_is_copied_is_refused(
     write: Callable[..., Path], first: PlannedRun, tmp_path: Path
 ) -> None:

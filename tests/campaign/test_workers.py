@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,23 @@ def test_failures_are_told_with_their_log_and_stop_nothing(make_job: MakeJob) ->
     assert str(failures[0]).startswith("echo out; echo wrong >&2; exit 3 ended with status 3")
     assert str(failures[0]).splitlines()[1:] == ["    out", "    wrong"]
     assert ended == ["late"]
+
+
+def test_a_job_that_cannot_write_its_log_is_named_and_stops_nothing(
+    make_job: MakeJob, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "elsewhere").write_text("years of work")
+    (tmp_path / "link.log").symlink_to(tmp_path / "elsewhere")
+    ended: list[str] = []
+    below = replace(make_job("echo in"), log=tmp_path / "file" / "run.log")
+    linked = replace(make_job("echo out"), log=tmp_path / "link.log")
+    last = make_job("true", lambda: ended.append("last") or [])
+    first, second = workers(1).work([below, linked, last])
+    assert "echo in could not be started" in str(first)
+    assert str(tmp_path / "file") in str(first) and "in the way" in str(first)
+    assert "symbolic link" in str(second)
+    assert ended == ["last"] and (tmp_path / "elsewhere").read_text() == "years of work"
 
 
 def test_no_more_processes_than_workers_and_what_follows_comes_first(make_job: MakeJob) -> None:
@@ -105,7 +123,7 @@ def test_good_end_without_the_work_is_a_failure(make_job: MakeJob) -> None:
     assert ended == ["next"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1])
 def test_signal_ends_all_processes(
     number: signal.Signals, make_job: MakeJob, tmp_path: Path
 ) -> None:

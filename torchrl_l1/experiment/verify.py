@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -61,7 +60,8 @@ def _load(path: Path) -> dict[str, dict[str, np.ndarray]]:
         raise FileNotFoundError(f"no trace file at {path}")
     try:
         archive = np.load(path)
-    except (ValueError, OSError, zipfile.BadZipFile) as error:
+    # What zipfile and NumPy raise of a damaged file has no common class.
+    except Exception as error:
         raise ValueError(f"{path} is not a NumPy .npz file: {error}") from error
     if not isinstance(archive, np.lib.npyio.NpzFile):
         raise ValueError(f"{path} holds a single array; expected an .npz of traces")
@@ -72,7 +72,7 @@ def _load(path: Path) -> dict[str, dict[str, np.ndarray]]:
             if separator and prefix.count("/") == 1:
                 try:
                     traces.setdefault(prefix, {})[field] = archive[key]
-                except ValueError as error:
+                except Exception as error:
                     raise ValueError(f"{path}: cannot read {key}: {error}") from error
         if not traces:
             raise ValueError(
