@@ -399,7 +399,7 @@ def test_sac_replays_what_the_policy_chose(kind):
 
     loss = SACLoss(
         actor,
-        ValueOperator(Critic(), in_keys=["observation", key]),
+        ValueOperator(Critic(), in_keys=["observation", key], out_keys=["state_action_value"]),
         num_qvalue_nets=1,
         action_spec=GymEnv("Pendulum-v1").action_spec,
     )

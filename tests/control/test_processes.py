@@ -26,8 +26,19 @@ from torchrl_l1.dynamics import EnsembleDynamics
 CONFIG = L1Config(0.05, epsilon=0.5, action_low=-2.0, action_high=2.0)
 
 
-def model(observation: Tensor, action: Tensor) -> Tensor:
-    return 0.01 * observation + 0.1 * action.sin().expand_as(observation)
+class Model:
+    """Changes of the observation with a known Jacobian, which needs no differentiation."""
+
+    def mean_change(self, observation: Tensor, action: Tensor) -> Tensor:
+        return self.value_and_jacobian(observation, action)[0]
+
+    def value_and_jacobian(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        value = 0.01 * observation + 0.1 * action.sin().expand_as(observation)
+        jacobian = 0.1 * action.cos().unsqueeze(-2).expand(*observation.shape, 1)
+        return value, jacobian
+
+
+model = Model()
 
 
 def act(observation: Tensor) -> Tensor:
@@ -67,10 +78,10 @@ def assert_is_the_core(data: TensorDictBase, u_rl: Tensor) -> None:
     assert ((u - u_rl).abs() > 0.05).any() and begins.any()
 
 
-@pytest.mark.filterwarnings("ignore:The default value of `exchange`:FutureWarning")
 @pytest.mark.parametrize("backend", ["threading", "multiprocessing"])
 def test_in_a_pool(backend):
-    pool = AsyncEnvPool([make_env, make_env], backend=backend, stack="dense")
+    options = {"exchange": "queue"} if backend == "multiprocessing" else {}
+    pool = AsyncEnvPool([make_env, make_env], backend=backend, stack="dense", **options)
     try:
         data, steps = pool.reset(), []
         for _ in range(4):

@@ -263,10 +263,13 @@ def advance(
         (action_key, action, state.q),
     ):
         if value.shape != like.shape:
+            hint = (
+                "; what changes it (a normaliser, a later transform, the policy) needs separate "
+                f"out_keys, or give {owner} the observation_key of the raw observation"
+            )
             raise ValueError(
                 f"{owner}: {name!r} has shape {tuple(value.shape)}, expected {tuple(like.shape)} "
-                f"as the state under {key!r}; what changes it (a normaliser, a later transform, "
-                "the policy) must have separate out_keys, or L1 another key to read"
+                f"as the state under {key!r}" + (hint if name == observation_key else "")
             )
     dtype = state.x_hat.dtype
     if seal is not None:

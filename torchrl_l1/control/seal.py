@@ -23,6 +23,8 @@ _EXTRA = 4  # started, n_switch, and two sums
 # Of entries of the same size: a change of type between float64 and float32 stays below it.
 _TOLERANCE = 1e-6
 
+_LARGEST = 3.3e38  # in the range of float32, to which float64 may be changed
+
 _IN_ACTION_UNITS = ("u_bar", "q", "sigma_m")
 
 
@@ -44,8 +46,10 @@ def sealed(observation: Tensor, state: L1State) -> Tensor:
     others = [state.x_hat, *(value for value in memory if value is not None)]
     others_sum = (torch.cat(others, -1) if len(others) > 1 else others[0]).sum(-1, keepdim=True)
     actions_sum = in_action_units.sum(-1, keepdim=True)
-    # What is not finite is a number of its own here, in the range of float32: see the diagnostics.
-    observation = observation.to(state.x_hat.dtype).nan_to_num(3.2e38, 3.3e38, -3.3e38)
+    # What is not finite is a number of its own here: whoever looks at the entries finds none.
+    dtype = state.x_hat.dtype
+    largest = min(torch.finfo(dtype).max, _LARGEST)
+    observation = observation.to(dtype).nan_to_num(0.9 * largest, largest, -largest)
     parts = [observation, started, n_switch, actions_sum, others_sum]
     return torch.cat(parts, -1)
 
