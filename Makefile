@@ -18,7 +18,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK ?= 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo test lint format docs bench bench-smoke wheel lock clean
+.PHONY: help demo hopper test lint format docs bench bench-smoke wheel lock clean
 
 help: ## Show this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' Makefile
@@ -26,7 +26,12 @@ help: ## Show this list
 demo: $(VENV)/.installed-base ## Train METRPO on the pendulum, then plot returns against actuator bias
 	$(BIN)/torchrl-l1 run metrpo/inverted_pendulum l1=off outer_iterations=5 seed=$(SEED) \
 	    run_dir=$(DEMO_DIR) --resume
-	$(BIN)/torchrl-l1 evaluate $(DEMO_DIR) --l1 off paper --bias 0 0.5 1 1.5 --filmstrip
+	$(BIN)/torchrl-l1 evaluate $(DEMO_DIR) --l1 off paper robust --bias 0 0.5 1 1.5 --filmstrip
+
+hopper: $(VENV)/.installed-base ## Train METRPO on Hopper, then deploy it with a bias, four ways (ten minutes)
+	$(BIN)/torchrl-l1 run metrpo/hopper l1=off outer_iterations=15 seed=$(SEED) \
+	    run_dir=runs/hopper --resume
+	$(BIN)/python docs/results/hopper.py runs/hopper
 
 test: $(VENV)/.installed-test ## Run the tests and the examples in the docstrings
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST_ARGS)

@@ -14,6 +14,7 @@ from benchmarks import (
     fitting,
     imagination,
     jacobian,
+    l1_controllers,
     l1_scaling,
     metrpo_iteration,
     planning,
@@ -30,6 +31,7 @@ RESULTS = Path(__file__).parent / "results"
 BENCHMARKS: dict[str, tuple[int, int, Callable[[int], Table]]] = {
     "jacobian": (jacobian.THREADS, 21, jacobian.table),
     "l1_scaling": (l1_scaling.THREADS, 9, l1_scaling.table),
+    "l1_controllers": (l1_controllers.THREADS, 15, l1_controllers.table),
     "env_stepping": (env_stepping.THREADS, 9, env_stepping.table),
     "collection": (collection.THREADS, 7, collection.table),
     "planning": (planning.THREADS, 9, planning.table),

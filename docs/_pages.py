@@ -25,6 +25,7 @@ PACKAGES = (
     "experiment",
     "campaign",
     "report",
+    "deployment",
 )
 
 # What a package documents beside its exports: by name, wherever in the package it stands.

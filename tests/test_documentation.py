@@ -167,7 +167,7 @@ def help_texts() -> dict[str, str]:
             main([*arguments, "--help"])
         return out.getvalue()
 
-    commands = re.findall(r"^    (\w+)  ", text(), re.MULTILINE)
+    commands = re.findall(r"^    (\w+)(?:  .*)?$", text(), re.MULTILINE)
     return {command: text(command) for command in commands}
 
 

@@ -1,8 +1,8 @@
 """Robust model-based reinforcement learning with L1 adaptive control, for TorchRL.
 
 The names users compose are exported here; everything else lives in the sub-packages ``control``,
-``dynamics``, ``planning``, ``envs``, ``objectives``, ``algorithms``, ``experiment``, ``campaign``
-and ``report``. They are loaded when first asked for: torch takes seconds.
+``dynamics``, ``planning``, ``envs``, ``objectives``, ``algorithms``, ``experiment``, ``campaign``,
+``report`` and ``deployment``. They are loaded when first asked for: torch takes seconds.
 """
 
 from __future__ import annotations
@@ -24,7 +24,12 @@ if TYPE_CHECKING:
         L1State,
         L1Transform,
     )
-    from torchrl_l1.dynamics import EnsembleDynamics, EnsembleDynamicsLoss, EnsembleModelEnv
+    from torchrl_l1.dynamics import (
+        EnsembleDynamics,
+        EnsembleDynamicsLoss,
+        EnsembleModelEnv,
+        fit_dynamics,
+    )
     from torchrl_l1.envs import BatchedMujocoEnv, make_env
     from torchrl_l1.planning import (
         CEMConfig,
@@ -52,14 +57,20 @@ __all__ = [
     "METRPOConfig",
     "ModelPredictiveController",
     "PETSConfig",
+    "RobustController",
     "ShootingConfig",
     "TrajectorySampler",
     "__version__",
+    "fit_dynamics",
     "make_env",
+    "robustify",
 ]
 
 # In the order in which they import each other: looking a name up loads no more than it needs.
-_PACKAGES = ("control", "dynamics", "envs", "objectives", "planning", "algorithms")
+_PACKAGES = (
+    *("control", "dynamics", "envs", "objectives", "planning", "algorithms"),
+    "deployment",
+)
 
 if "gymnasium" in sys.modules:
     register_tasks()

@@ -4,7 +4,7 @@
 
 Reads the tables that `torchrl-l1 evaluate` wrote into FOLDER/TASK/seed_N/bias and .../noise, if a
 FOLDER is given, and keeps their episodes in `robust/TASK.csv` beside this file. Writes from those
-`robust/TASK.md`, `robust/harm.md` and `robust/TASK.png`.
+`robust/TASK.md`, `robust/TASK.png`, `robust/overall.md` and `robust/harm.md`.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from typing import Any
 import numpy as np
 
 from torchrl_l1.algorithms import METRPO
+from torchrl_l1.experiment.files import write_table
 from torchrl_l1.experiment.matrix import disturbance_words
-from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.report.evaluation_summary import summarize, summary_lines
 from torchrl_l1.report.page import markdown
 from torchrl_l1.report.recovery import MEDIANS, plot_heat_map
+from torchrl_l1.report.statistics import recovered
 
 HERE = Path(__file__).with_name("robust")
 TASKS = ("inverted_pendulum", "swimmer", "hopper", "walker", "half_cheetah")
@@ -92,9 +93,35 @@ def harm(episodes: Sequence[Row], noise: str, l1: str, draws: int = 4000) -> dic
     return {"mean": f"{mean:+.1f}", "interval": f"[{low:+.1f}, {high:+.1f}]"}
 
 
+def overall(episodes: Sequence[Row]) -> dict[str, str]:
+    """What the controllers recover of all disturbances together, every one with the same weight."""
+    runs = sorted({row["run"] for row in episodes})
+
+    def returns(l1: str, run: str) -> np.ndarray:
+        rows = [
+            row
+            for row in episodes
+            if (row["run"], row["l1"], row["noise"]) == (run, l1, "none")
+            and not row["bias"] == 0 == row["signs"]
+        ]
+        rows.sort(key=lambda row: (row["bias"], row["signs"], row["episode"]))
+        return np.array([row["return"] for row in rows])
+
+    of = {l1: [returns(l1, run) for run in runs] for l1 in ("off", "paper", "robust", "oracle")}
+    line = {name: f"{np.mean(np.concatenate(values)):.0f}" for name, values in of.items()}
+    for l1 in ("paper", "robust"):
+        found = recovered(of["off"], of[l1], of["oracle"])
+        share = "–"
+        if found.share is not None and found.interval is not None:
+            share = f"{found.share:.2f} [{found.interval.low:.2f}, {found.interval.high:.2f}]"
+        line[f"{l1} recovered"] = share
+    return line
+
+
 def main() -> None:
     """Read what is new, then write all tables and figures."""
-    lines = []
+    lines: list[Row] = []
+    totals: list[Row] = []
     for task in TASKS:
         if len(sys.argv) > 1:
             gather(Path(sys.argv[1]), task)
@@ -106,9 +133,10 @@ def main() -> None:
         biased = [row for row in summary if row["noise"] == "none"]
         (HERE / f"{task}.md").write_text(markdown(summary_lines(biased)) + "\n")
         plot_heat_map(biased, MEDIANS, task, HERE / f"{task}.png", METRPO.facts)
+        policies = str(len({row["run"] for row in episodes}))
+        totals.append({"task": task, "policies": policies, **overall(episodes)})
         for noise in dict.fromkeys(row["noise"] for row in episodes):
-            line = {"task": task, "policies": str(len({r["run"] for r in episodes}))}
-            line |= {"noise": noise}
+            line = {"task": task, "policies": policies, "noise": noise}
             for l1 in ("paper", "robust"):
                 found = harm(episodes, noise, l1)
                 line[f"L1 {l1}, %"] = f"{found['mean']} {found['interval']}"
@@ -116,6 +144,7 @@ def main() -> None:
         for row in biased:
             if row["l1"] == "robust" and "recovered" in row:
                 print(task, disturbance_words(row), f"{row['recovered']:.2f}")
+    (HERE / "overall.md").write_text(markdown(totals) + "\n")
     (HERE / "harm.md").write_text(markdown(lines) + "\n")
     print(f"Tables and figures: {HERE}")
 

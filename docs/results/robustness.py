@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchrl_l1.experiment.run_directory import write_table
+from torchrl_l1.experiment.files import write_table
 from torchrl_l1.report.evaluation_summary import summary_lines
 from torchrl_l1.report.page import markdown
 

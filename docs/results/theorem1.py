@@ -22,7 +22,7 @@ from torch import Tensor
 
 from torchrl_l1.control import ActionJacobian, L1Config, init, solve_matched
 from torchrl_l1.control.affine import augment
-from torchrl_l1.experiment.run_directory import write_table
+from torchrl_l1.experiment.files import write_table
 from torchrl_l1.report.page import markdown
 from torchrl_l1.report.style import color, grid, legend_below, save
 

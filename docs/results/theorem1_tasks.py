@@ -20,7 +20,8 @@ from torch import Tensor
 from torchrl_l1.control import solve_matched
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.experiment.evaluate import load_run
-from torchrl_l1.experiment.run_directory import RunDirectory, write_table
+from torchrl_l1.experiment.files import write_table
+from torchrl_l1.experiment.run_directory import RunDirectory
 from torchrl_l1.report.page import markdown
 from torchrl_l1.report.style import color, grid, save, title
 

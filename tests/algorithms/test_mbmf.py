@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from copy import deepcopy
 
@@ -26,6 +27,7 @@ from torchrl_l1.planning import ShootingConfig
 METRICS = MBMF.facts.metrics
 
 L1 = L1Config(0.04, epsilon=0.2, action_low=-3.0, action_high=3.0)
+ROBUST = L1Config.robust(0.04, action_low=-3.0, action_high=3.0)
 
 
 def tiny(**changes: object) -> MBMFConfig:
@@ -65,8 +67,10 @@ def test_every_stage_reports_what_it_did() -> None:
     assert results[4]["return_mean"] != results[4]["return_deterministic"]
 
 
-@pytest.mark.parametrize("l1", [None, L1], ids=["off", "on"])
-@pytest.mark.parametrize("done", range(1, 6))
+@pytest.mark.parametrize(
+    ("l1", "done"),
+    [*itertools.product([None, L1], range(1, 6)), (ROBUST, 1)],
+)
 def test_resumed_run_repeats_the_unbroken_one(l1: L1Config | None, done: int) -> None:
     unbroken = [result.metrics for result in make(l1).iterate()]
     first = make(l1)

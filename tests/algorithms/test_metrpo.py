@@ -15,6 +15,7 @@ from torchrl_l1.objectives import TRPOConfig
 METRICS = METRPO.facts.metrics
 
 L1 = L1Config(0.04, epsilon=0.2, action_low=-3.0, action_high=3.0)
+ROBUST = L1Config.robust(0.04, action_low=-3.0, action_high=3.0)
 
 
 def tiny(**changes: object) -> METRPOConfig:
@@ -83,7 +84,7 @@ def test_noise_on_the_actuator_is_not_in_the_data() -> None:
     assert data["next", "observation"][:, 0, 2].mean() > 0.2
 
 
-@pytest.mark.parametrize("l1", [None, L1])
+@pytest.mark.parametrize("l1", [None, L1, ROBUST], ids=["off", "paper", "robust"])
 def test_resumed_run_repeats_the_unbroken_one(l1: L1Config | None) -> None:
     unbroken = [result.metrics for result in make(l1, outer_iterations=3).iterate()]
     first = make(l1, outer_iterations=3)
@@ -94,6 +95,19 @@ def test_resumed_run_repeats_the_unbroken_one(l1: L1Config | None) -> None:
     second.load_state_dict(state)
     after = [result.metrics for result in second.iterate()]
     assert before + after == unbroken
+
+
+def test_a_kalman_filter_is_calibrated_after_every_fit() -> None:
+    algorithm = make(ROBUST)
+    residuals = algorithm.acting_dynamics.residuals
+    before = residuals.process_noise.clone()
+    residuals.process_noise.fill_(0.5)
+    next(algorithm.iterate())
+    assert residuals.process_noise != 0.5
+    assert residuals.measured
+    plain = make(L1)
+    next(plain.iterate())
+    assert plain.acting_dynamics.residuals.process_noise == before
 
 
 def test_seeds_matter() -> None:

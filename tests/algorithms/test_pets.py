@@ -13,6 +13,7 @@ from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.planning import CEMConfig
 
 L1 = L1Config(0.04, epsilon=0.2, action_low=-3.0, action_high=3.0)
+ROBUST = L1Config.robust(0.04, covariance="sum", action_low=-3.0, action_high=3.0)
 
 
 def tiny(head: str = "gaussian", **changes: object) -> PETSConfig:
@@ -47,7 +48,7 @@ def test_every_metric_is_finite(head: str, propagation: str) -> None:
     assert not (data["action"] == data["executed"])[20:].all()
 
 
-@pytest.mark.parametrize("l1", [None, L1], ids=["off", "on"])
+@pytest.mark.parametrize("l1", [None, L1, ROBUST], ids=["off", "paper", "robust"])
 def test_resumed_run_repeats_the_unbroken_one(l1: L1Config | None) -> None:
     unbroken = [result.metrics for result in make(l1, outer_iterations=3, fit_every=2).iterate()]
     first = make(l1, outer_iterations=3, fit_every=2)

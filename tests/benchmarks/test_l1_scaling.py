@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from benchmarks import collection, l1_scaling
+from benchmarks import collection, l1_controllers, l1_scaling
 
 
 def test_scaling_has_a_row_per_size_and_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -29,3 +29,13 @@ def test_collection_is_measured_with_both_actors(monkeypatch: pytest.MonkeyPatch
     (row,) = table.rows
     assert set(table.columns) <= set(row)
     assert min(float(row[name]) for name in ("off", "eager", "torchrl", "actor_ratio")) > 0
+
+
+def test_controllers_have_a_row_per_task_and_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(l1_controllers, "SIZES", (2,))
+    monkeypatch.setattr(l1_controllers, "HIDDEN", (8,))
+    monkeypatch.setattr(l1_controllers, "MODES", {"eager": False})
+    monkeypatch.setattr(l1_controllers, "THREAD_COUNTS", (1,))
+    table = l1_controllers.table(1)
+    assert [row["task"] for row in table.rows] == ["inverted_pendulum", "half_cheetah"]
+    assert all(set(table.columns) <= set(row) for row in table.rows)

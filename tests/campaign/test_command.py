@@ -27,8 +27,9 @@ from torchrl_l1.campaign.progress import overview
 from torchrl_l1.campaign.workers import TEMPORARY_FAILURE
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.errors import RunDirectoryError
+from torchrl_l1.experiment.files import locked
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.run_directory import RunDirectory, locked
+from torchrl_l1.experiment.run_directory import RunDirectory
 
 PENDULUM = "metrpo/inverted_pendulum"
 
@@ -168,9 +169,10 @@ def test_skips_finishes_evaluates_and_goes_on_past_a_failure(
     os.utime(fresh.directory.checkpoint_file)
     assert "finished, 1 of 1 evaluations" in overview([fresh])
     assert load_yaml(described)["iterations"] == 2
+    # A row that the run has not written is none.
     with fresh.directory.metrics_file.open("a") as file:
         file.write("another,row\n")
-    assert "finished, 0 of 1 evaluations" in overview([fresh])
+    assert "0 of 2 iterations" in overview([fresh])
 
 
 def test_evaluation_sweeps_epsilon_and_alpha(campaign_file: Path) -> None:

@@ -17,8 +17,9 @@ from torchrl_l1.campaign.evaluation import evaluate_run, is_evaluated
 from torchrl_l1.campaign.plan import PlannedRun, plan
 from torchrl_l1.campaign.reuse import copy_run, find_reusable
 from torchrl_l1.cli import main
+from torchrl_l1.experiment.files import locked
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.run_directory import RunDirectory, locked
+from torchrl_l1.experiment.run_directory import RunDirectory
 from torchrl_l1.report import find_runs
 from torchrl_l1.report.study import Study
 

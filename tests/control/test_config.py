@@ -2,7 +2,11 @@ from __future__ import annotations
 
 import math
 
+import gymnasium
+import numpy as np
 import pytest
+import torch
+from torchrl.data import Bounded
 
 from torchrl_l1.control import L1Config
 
@@ -103,3 +107,41 @@ def test_lists_become_tuples_and_configurations_hash():
 def test_unknown_setting_is_refused():
     with pytest.raises(TypeError, match="omega"):
         L1Config(0.1, omega=3.0)
+
+
+def test_numbers_arrays_tensors_and_specs_of_others():
+    low, high = torch.tensor([-2.0, -1.0]), torch.tensor([2.0, 3.0])
+    expected = L1Config(0.5, epsilon=3.0, action_low=(-2.0, -1.0), action_high=(2.0, 3.0))
+    spec = Bounded(low, high, (2,))
+    batched = spec.expand(4, 2)
+    box = gymnasium.spaces.Box(low.numpy(), high.numpy())
+    for given in ((low, high), (low.numpy(), high.numpy()), (low.tolist(), high.tolist())):
+        assert L1Config(np.float64(0.5), epsilon=3, action_low=given[0], action_high=given[1]) == (
+            expected
+        )
+    for given in (spec, batched, spec.space, box):
+        found = L1Config(
+            torch.tensor(0.5), epsilon=np.float32(3), action_low=given, action_high=given
+        )
+        assert found == expected and hash(found) == hash(expected)
+        assert all(type(value) is float for value in (found.dt, found.epsilon, *found.action_low))
+    scalar = L1Config(0.1, action_low=np.float32(-2), action_high=torch.tensor(2.0))
+    assert (scalar.action_low, scalar.action_high) == (-2.0, 2.0)
+    assert L1Config(0.1, a_s=np.array([-1.0, -2.0])).a_s == (-1.0, -2.0)
+    assert L1Config(0.1, project=np.bool_(False)).project is False
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"action_low": torch.tensor([[-1.0], [-2.0]])}, "same entries for all environments"),
+        ({"action_low": torch.tensor([torch.nan])}, "action_low must be a number"),
+        ({"action_low": np.array([])}, "non-empty"),
+        ({"epsilon": torch.zeros(2)}, "epsilon must be a finite number"),
+        ({"epsilon": np.bool_(True)}, "epsilon must be a finite number"),
+        ({"dt": torch.tensor(torch.nan)}, "dt must be a finite number"),
+    ],
+)
+def test_bad_arrays_are_named(settings, message):
+    with pytest.raises(ValueError, match=message):
+        L1Config(**{"dt": 0.1, **settings})

@@ -7,10 +7,27 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import (
+    InteractionType,
+    NormalParamExtractor,
+    TensorDictModule,
+    TensorDictSequential,
+)
 from torch import nn
-from torchrl.envs import Compose, DoubleToFloat, GymEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.collectors import Collector
+from torchrl.data import Composite, LazyTensorStorage, ReplayBuffer
+from torchrl.envs import (
+    ActionScaling,
+    Compose,
+    DoubleToFloat,
+    GymEnv,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
+from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.modules.utils import get_primers_from_module
+from torchrl.objectives import ClipPPOLoss, SACLoss
 
 from torchrl_l1.control import ActionJacobian, L1Config, L1Controller, L1Transform, init, step
 from torchrl_l1.dynamics import EnsembleDynamics
@@ -40,10 +57,6 @@ def test_controller_and_transform_give_the_same_trajectory(config):
     model, actor = make_model(), make_actor()
     controller = L1Controller(model, config)
     inside = make_env(3, L1Transform(model, config)).rollout(25, actor, break_when_any_done=False)
-    if config.action_low is None:
-        # The transform takes the bounds of the action spec, the controller has no environment.
-        config = L1Config.reference(0.04, epsilon=0.02, action_low=-3.0, action_high=3.0)
-        controller = L1Controller(model, config)
     outside = make_env(3, controller.make_primer()).rollout(
         25, TensorDictSequential(actor, controller), break_when_any_done=False
     )
@@ -231,3 +244,176 @@ def test_residual_of_a_slow_disturbance_is_of_the_order_of_the_sampling_time():
 def test_without_disturbance_nothing_happens():
     u_a, sigma_m, unmatched, matched = simulate(L1Config(0.04), lambda t: np.zeros(3), steps=50)
     assert max(np.abs(v).max() for v in (u_a, sigma_m, unmatched, matched)) < 1e-12
+
+
+def test_bounds_and_time_step_come_from_the_environment_or_its_spec():
+    def pushes(controller: L1Controller) -> tuple[torch.Tensor, torch.Tensor]:
+        env = make_env(2, controller.make_primer())
+        strong = TensorDictModule(lambda x: 5.0 + 0 * x[..., :1], ["observation"], ["action"])
+        data = env.rollout(6, TensorDictSequential(strong, controller), break_when_any_done=False)
+        env.close()
+        return data["action"], data["l1", "q"]
+
+    expected = L1Config(0.04, epsilon=0.02, action_low=-3.0, action_high=3.0)
+    spec = GymEnv("InvertedPendulum-v5").action_spec
+    results = []
+    for settings in (
+        {"config": expected},
+        {"dt": 0.04, "epsilon": 0.02},
+        {"epsilon": 0.02},
+        {"config": L1Config(0.04, epsilon=0.02), "action_spec": spec},
+        {"dt": 0.04, "epsilon": 0.02, "action_spec": Composite(action=spec)},
+        {"epsilon": 0.02, "action_low": -3.0},
+    ):
+        controller = L1Controller(make_model(), **settings)
+        results.append(pushes(controller))
+        assert controller.config == expected
+    for action, q in results[1:]:
+        assert torch.equal(action, results[0][0]) and torch.equal(q, results[0][1])
+    assert results[0][0].max() == 3.0
+    free = L1Controller(make_model(), dt=0.04, action_low=-torch.inf, action_high=torch.inf)
+    pushes(free)
+    assert free.config.action_high == torch.inf
+
+
+def test_what_is_not_known_is_asked_for():
+    unknown = L1Controller(make_model())
+    with pytest.raises(ValueError, match="knows dt once an environment with its primer"):
+        unknown(tensordict(unknown))
+    unbounded = L1Controller(make_model(), dt=0.04)
+    data = tensordict(unbounded)
+    with pytest.warns(
+        UserWarning, match="no action bounds, .* give it action_spec=env.action_spec"
+    ):
+        unbounded(data)
+    with pytest.raises(ValueError, match=r"give config or \['dt', 'epsilon'\], not both"):
+        L1Controller(make_model(), CONFIG, dt=0.04, epsilon=0.1)
+    with pytest.raises(TypeError, match=r"L1Controller got unknown settings \['epsilonn'\]"):
+        L1Controller(make_model(), dt=0.04, epsilonn=0.1)
+    with pytest.raises(ValueError, match="action_spec has several entries"):
+        spec = GymEnv("InvertedPendulum-v5").action_spec
+        L1Controller(make_model(), dt=0.04, action_spec=Composite(one=spec, other=spec.clone()))
+
+
+def test_one_controller_in_environments_with_different_bounds_is_refused():
+    controller = L1Controller(lambda x, u: 0.1 * u.expand_as(x), observation_dim=3, action_dim=1)
+    env = TransformedEnv(GymEnv("Pendulum-v1"), controller.make_primer())
+    env.reset()
+    scaled = TransformedEnv(
+        GymEnv("Pendulum-v1"), Compose(controller.make_primer(), ActionScaling())
+    )
+    with pytest.raises(ValueError, match="environments with different action bounds"):
+        scaled.reset()
+
+
+def test_random_frames_first():
+    controller = L1Controller(make_model(), epsilon=0.02)
+    env = make_env(2, controller.make_primer())
+    collector = Collector(
+        env,
+        TensorDictSequential(make_actor(), controller),
+        frames_per_batch=12,
+        total_frames=24,
+        init_random_frames=12,
+        auto_register_policy_transforms=False,
+    )
+    first, second = list(collector)
+    collector.shutdown()
+    # L1 starts where the policy does, within an episode.
+    assert not first["l1", "started"].any() and not first["next", "l1", "u_exec"].any()
+    assert second["l1", "started"].any() and not second["l1", "started"][:, 0].any()
+
+
+def test_predictions_of_several_members_under_a_name():
+    module = TensorDictModule(
+        lambda x, u: (torch.stack([0.1 * x + u, 0.3 * x + u]), x),
+        ["observation", "action"],
+        ["members", "other"],
+    )
+    options = {"out_key": "members", "ensemble_dim": 0}
+    controller = L1Controller(module, CONFIG, observation_dim=4, action_dim=1, **options)
+    data = tensordict(controller, observation=torch.ones(2, 4), action=torch.ones(2, 1))
+    torch.testing.assert_close(controller(data)["next", "l1", "x_hat"], torch.full((2, 4), 2.2))
+    env = make_env(2, L1Transform(module, dt=0.04, **options))
+    assert env.rollout(3)["next", "l1", "started"].all()
+    with pytest.raises(ValueError, match="belong to the ActionJacobian"):
+        L1Transform(ActionJacobian(make_model()), dt=0.04, ensemble_dim=0)
+
+
+def push(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+    return 0.01 * x + 0.1 * u.expand_as(x)
+
+
+def collected(kind: str) -> tuple[L1Controller | None, ProbabilisticActor, TensorDict]:
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Linear(3, 16), nn.Tanh(), nn.Linear(16, 2), NormalParamExtractor())
+    actor = ProbabilisticActor(
+        TensorDictModule(network, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": -2.0, "high": 2.0},
+        return_log_prob=True,
+        default_interaction_type=InteractionType.RANDOM,
+    )
+    with torch.no_grad():
+        if kind == "transform":
+            env = TransformedEnv(GymEnv("Pendulum-v1"), L1Transform(push, epsilon=10.0))
+            return None, actor, env.rollout(32, actor)
+        controller = L1Controller(push, epsilon=10.0, observation_dim=3, action_dim=1)
+        env = TransformedEnv(GymEnv("Pendulum-v1"), controller.make_primer())
+        return controller, actor, env.rollout(32, TensorDictSequential(actor, controller))
+
+
+@pytest.mark.parametrize("kind", ["controller", "transform"])
+def test_ppo_has_a_ratio_of_one_for_an_unchanged_policy(kind):
+    controller, actor, data = collected(kind)
+    critic = ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
+    loss = ClipPPOLoss(actor, critic)
+    loss.make_value_estimator(gamma=0.99, lmbda=0.95)
+    if controller is not None:
+        assert loss(data.clone())["kl_approx"].abs() > 0.01
+        loss.set_keys(action=controller.policy_action_key)
+    loss.value_estimator(data)
+    result = loss(data)
+    assert result["kl_approx"].abs() < 1e-5 and result["clip_fraction"] == 0
+    # All ratios are one: the objective is the mean advantage.
+    expected = -data["advantage"].mean()
+    torch.testing.assert_close(result["loss_objective"], expected, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore:No target network updater:UserWarning")
+@pytest.mark.parametrize("kind", ["controller", "transform"])
+def test_sac_replays_what_the_policy_chose(kind):
+    controller, actor, data = collected(kind)
+    key = "action" if controller is None else controller.policy_action_key
+    seen = []
+
+    class Critic(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.linear = nn.Linear(4, 1)
+
+        def forward(self, observation, action):
+            seen.append(action.detach())
+            return self.linear(torch.cat([observation, action], -1))
+
+    loss = SACLoss(
+        actor,
+        ValueOperator(Critic(), in_keys=["observation", key]),
+        num_qvalue_nets=1,
+        action_spec=GymEnv("Pendulum-v1").action_spec,
+    )
+    loss.make_value_estimator(gamma=0.99)
+    if controller is not None:
+        loss.set_keys(action=controller.policy_action_key)
+    buffer = ReplayBuffer(storage=LazyTensorStorage(32), batch_size=32)
+    buffer.extend(data)
+    sample = buffer[:]
+    result = loss(sample)
+    sum(value for name, value in result.items() if name.startswith("loss_")).backward()
+    chosen = data[key]
+    executed = data["next", "l1", "u_exec"]
+    assert not torch.equal(chosen, executed)
+    found = [action.reshape(chosen.shape) for action in seen if action.numel() == chosen.numel()]
+    assert any(torch.equal(action, chosen) for action in found)
+    assert not any(torch.equal(action, executed) for action in found)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from torchrl_l1.control import ActionJacobian, L1Config, L1State, ResidualStatistics, init, step
 from torchrl_l1.control.affine import augment, make_step
 from torchrl_l1.control.kalman import Posterior, measurement_update, noise_ratio, significant
+from torchrl_l1.control.kalman_law import Reach
 from torchrl_l1.control.least_squares import solve_matched, whitened
 
 BOUNDS = {"action_low": -1.0, "action_high": 1.0}
@@ -169,7 +170,7 @@ def test_a_bias_is_cancelled_and_its_absence_left_alone():
     deviation = torch.tensor([0.01, 0.1, 1.0])
     jacobian = torch.tensor([[0.02, 0.0], [0.1, 0.1], [0.5, -0.5]])
     noise = torch.randn(300, 200, 3, generator=generator) * deviation
-    config = L1Config.robust(0.05, inflation=1.0, **BOUNDS)
+    config = L1Config.robust(0.05, inflation=1.0, process_noise=0.003, **BOUNDS)
     statistics = ResidualStatistics(torch.diag(deviation.square()))
     bias = torch.tensor([0.3, -0.3]).expand(200, 2)
     _, _, inputs = simulate(config, statistics, jacobian, bias, noise)
@@ -311,3 +312,39 @@ def test_what_is_not_finite_stays_in_its_environment(which, value):
 def test_settings_out_of_their_domain_are_refused(settings, words):
     with pytest.raises(ValueError, match=words):
         L1Config.robust(0.05, **settings)
+
+
+def test_what_lies_beyond_the_bounds_is_neither_noise_nor_news():
+    config = L1Config.robust(0.05, action_low=-1.0, action_high=1.0)
+    posterior = Posterior(torch.tensor([0.3, 0.3, -0.3, 0.0]), 0.01 * torch.eye(4))
+    reach = Reach.of(config, torch.tensor([0.5, 0.9, 1.0, 1.0]), posterior)
+    torch.testing.assert_close(reach.passed, torch.tensor([0.3, 0.1, -0.3, 0.0]))
+    assert reach.within.tolist() == [True, False, True, False]
+    torch.testing.assert_close(reach.deviation, torch.tensor([0.0, 0.05**0.5, 0.0, 0.1]))
+    unbounded = Reach.of(L1Config.robust(0.05), torch.ones(4), posterior)
+    torch.testing.assert_close(unbounded.passed, posterior.mean)
+    assert unbounded.within.all() and not unbounded.deviation.any()
+
+
+@pytest.mark.parametrize("cut_off", [True, False], ids=["motor command", "load"])
+def test_a_disturbance_of_actuators_at_their_bounds_is_found_whether_cut_off_or_not(cut_off):
+    generator = torch.Generator().manual_seed(5)
+    batch, steps, n, m = 50, 400, 4, 2
+    # It estimates only: input that cancels the bias keeps the sum within the bounds.
+    config = L1Config.robust(0.05, action_low=-1.0, action_high=1.0, dead_zone=1e6)
+    deviation = torch.tensor([0.02, 0.02, 0.1, 0.1])
+    statistics = ResidualStatistics(torch.diag(deviation.square()), 1.0, 0.003)
+    state = init([batch], n, m, config)
+    x, bias = torch.zeros(batch, n), torch.tensor([0.4, -0.4])
+    for _ in range(steps):
+        jacobian = 0.1 * torch.randn(batch, n, m, generator=generator)
+        # At a bound in two thirds of the steps, as policies of fast gaits are.
+        u_rl = (3 * torch.randn(batch, m, generator=generator)).clamp(-1, 1)
+        u, state, _ = step(
+            config, state, x, u_rl, torch.zeros_like(x), jacobian, residuals=statistics
+        )
+        force = (u + bias).clamp(-1, 1) if cut_off else u + bias
+        noise = deviation * torch.randn(batch, n, generator=generator)
+        x = x + (jacobian @ force.unsqueeze(-1)).squeeze(-1) + noise
+    torch.testing.assert_close(state.sigma_m.mean(0), bias, atol=0.05, rtol=0)
+    assert state.noise.mean() < 1.5

@@ -64,8 +64,6 @@ def test_settings_come_from_a_config_or_from_keywords():
     assert L1Transform(make_model(), config).config is config
     with pytest.raises(ValueError, match=r"give config or \['dt', 'alpha'\], not both"):
         L1Transform(make_model(), config, dt=0.1, alpha=0.2)
-    with pytest.raises(ValueError, match="L1Transform needs dt"):
-        L1Transform(make_model())
     with pytest.raises(ValueError, match="dt must be a positive time"):
         L1Transform(make_model(), dt=0.0)
     with pytest.raises(TypeError, match=r"unknown settings \['epsilonn'\]"):
@@ -117,7 +115,7 @@ def test_diagnostics_can_be_left_out():
     env = make_env(L1Transform(make_model(), dt=0.05, diagnostics=False))
     data = env.rollout(3, make_actor())
     assert set(data["next", "l1"].keys()) == {
-        "x_hat", "u_bar", "q", "sigma_m", "n_switch", "started", "u_exec",
+        "x_hat", "u_bar", "q", "sigma_m", "n_switch", "started", "seal", "u_exec",
     }  # fmt: skip
     full = make_env(L1Transform(make_model(), dt=0.05)).observation_spec["l1"]
     assert set(L1Diagnostics._fields) < set(full.keys())

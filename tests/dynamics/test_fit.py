@@ -10,10 +10,13 @@ from torchrl_l1.dynamics import (
     EnsembleDynamicsLoss,
     FitConfig,
     Head,
+    Transitions,
     evaluate_members,
+    fit_dynamics,
     fit_ensemble,
     make_dynamics,
 )
+from torchrl_l1.dynamics.fit import fit_to_transitions
 
 
 def transitions(count: int, noise: float = 0.0) -> TensorDict:
@@ -169,9 +172,11 @@ def test_gradient_steps_are_bounded_and_best_weights_are_kept() -> None:
 
 
 def test_nothing_to_validate_on_is_an_error() -> None:
+    with pytest.raises(ValueError, match="1 training and 0 validation"):
+        fitted("action", FitConfig(), transitions(10)[1:2])
     data = transitions(10)
-    data["validation"][:] = False
-    with pytest.raises(ValueError, match="0 validation"):
+    data["validation"][:] = True
+    with pytest.raises(ValueError, match="0 training and 10 validation"):
         fitted("action", FitConfig(), data)
 
 
@@ -300,3 +305,63 @@ def test_settings_that_do_not_fit_the_model_leave_it_alone(
 def test_impossible_settings_are_named(settings: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         FitConfig(**settings)  # type: ignore[arg-type]
+
+
+def test_a_buffer_with_a_flag_is_fitted_as_ever() -> None:
+    """What the algorithms do: reading the buffer changes neither rows nor random numbers."""
+    data = transitions(200)
+    mask = data["validation"]
+    rows = data.select("observation", "action", ("next", "observation"))
+    weights = []
+    for read in (False, True):
+        torch.manual_seed(0)
+        model = EnsembleDynamics(2, 1, members=2, hidden=(8,))
+        optimizer = torch.optim.Adam(model.parameters())
+        config = FitConfig(max_epochs=3, batch_size=40)
+        if read:
+            buffer = ReplayBuffer(storage=LazyTensorStorage(len(data)))
+            buffer.extend(data)
+            fit_ensemble(model, buffer, config, optimizer)
+        else:
+            plain = Transitions(rows, mask, torch.zeros_like(mask), 0)
+            fit_to_transitions(model, plain, config, optimizer)
+        weights.append(torch.cat([value.flatten() for value in model.state_dict().values()]))
+    assert torch.equal(*weights)
+
+
+def test_a_model_of_ones_own_data() -> None:
+    data = transitions(1000).double().exclude("validation")
+    settings = {"hidden": (32,), "members": 3, "activation": "tanh", "max_gradient_steps": 600}
+    state = torch.get_rng_state()
+    model = fit_dynamics(data, **settings, validation_fraction=0.2, learning_rate=3e-3, seed=4)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert not model.training and model.quality.validation == 200
+    assert model.quality.warning == "" and min(model.quality.explained) > 0.98
+    _, jacobian = model.value_and_jacobian(torch.zeros(1, 2), torch.zeros(1, 1))
+    torch.testing.assert_close(jacobian, torch.tensor([[[0.5], [20.0]]]), rtol=0.15, atol=0.05)
+    again = fit_dynamics(data, **settings, validation_fraction=0.2, learning_rate=3e-3, seed=4)
+    for one, other in zip(model.parameters(), again.parameters(), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_actions_that_say_nothing_make_no_model_for_l1() -> None:
+    torch.manual_seed(0)
+    data = transitions(60, noise=50.0).exclude("validation")
+    with pytest.warns(UserWarning, match="the model is too poor for L1: its members differ by"):
+        model = fit_dynamics(data, hidden=(32,), max_epochs=3)
+    assert model.quality.warning in str(model.quality)
+
+
+def test_a_setting_that_does_not_exist_is_named() -> None:
+    with pytest.raises(TypeError, match=r"no setting 'layers': those of the model .*hidden.*fit "):
+        fit_dynamics(transitions(10), layers=3)
+    with pytest.raises(ValueError, match="names must hold one for each of the observation's 2"):
+        fit_dynamics(transitions(10), names=["x"])
+
+
+def test_data_of_another_width_leave_the_model_alone() -> None:
+    model = EnsembleDynamics(3, 1, members=2, hidden=(4,))
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    with pytest.raises(ValueError, match=r"takes observations of width 3 .* the data have 2 and 1"):
+        fit_once(model, transitions(50), FitConfig())
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())

@@ -7,10 +7,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
+from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.dynamics.fit import one_step_residuals
 from torchrl_l1.dynamics.heads import GaussianHead
-from torchrl_l1.dynamics.residuals import Residuals, shrunk_covariance
+from torchrl_l1.dynamics.residuals import (
+    Residuals,
+    calibrate_filter,
+    shrunk_covariance,
+    stretches,
+)
 
 
 def test_many_residuals_have_the_covariance_that_they_were_drawn_from():
@@ -102,3 +108,66 @@ def test_one_step_residuals_are_what_the_mean_misses():
         {"observation": x, "action": u, "next": {"observation": following}}, batch_size=[7]
     )
     torch.testing.assert_close(one_step_residuals(model, data, chunk=3), missed)
+
+
+def episodes(lengths: list[int], *, seed: int = 0) -> TensorDict:
+    """Transitions of a noisy integrator, one episode after the other ``[N]``."""
+    generator = torch.Generator().manual_seed(seed)
+    parts = []
+    for length in lengths:
+        action = torch.randn(length, 1, generator=generator)
+        change = 0.1 * action + 0.01 * torch.randn(length, 1, generator=generator)
+        states = torch.cat([torch.randn(1, 1, generator=generator), change]).cumsum(0)
+        parts.append(
+            TensorDict(
+                {
+                    "observation": states[:-1],
+                    "action": action,
+                    "next": {"observation": states[1:]},
+                },
+                batch_size=[length],
+            )
+        )
+    return torch.cat(parts)
+
+
+def test_stretches_lie_within_episodes_and_are_the_last_ones():
+    data = episodes([250, 99, 30, 410])
+    rows = stretches(data)
+    assert rows.tolist() == [
+        list(range(first, first + 100)) for first in (0, 100, 379, 479, 579, 679)
+    ]
+    many = stretches(episodes([1000] * 5))
+    assert many.shape == (32, 100) and many[-1, -1] == 4999
+    assert stretches(episodes([60, 60, 45])).tolist() == [list(range(60)), list(range(60, 120))]
+    assert stretches(episodes([19, 5, 12])) is None and stretches(data[:1]) is None
+
+
+def test_calibration_sets_what_the_controller_is_told():
+    def known(observation, action):
+        return 0.1 * action, torch.full((*action.shape, 1), 0.1)
+
+    residuals = Residuals(1)
+    residuals.measure(torch.tensor([[0.01], [-0.01]]))
+    config = L1Config.robust(0.05, action_low=-1.0, action_high=1.0)
+    found = calibrate_filter(residuals, known, episodes([400] * 8), config)
+    assert residuals.inflation == found.inflation == 1
+    assert residuals.process_noise == pytest.approx(found.process_noise)
+    # Too short: nothing changes.
+    assert calibrate_filter(residuals, known, episodes([10]), config) is None
+    assert residuals.inflation == 1
+
+
+def test_a_missing_force_inflates_the_covariance():
+    def lacking(observation, action):
+        # Knows nothing of what pulls the state back to zero for many steps.
+        return torch.zeros_like(action), torch.full((*action.shape, 1), 0.1)
+
+    data = episodes([400] * 8)
+    slow = torch.sin(torch.arange(data.shape[0] + 1) / 40).unsqueeze(-1)
+    data["observation"], data["next", "observation"] = slow[:-1], slow[1:]
+    residuals = Residuals(1)
+    residuals.measure(slow[1:] - slow[:-1])
+    config = L1Config.robust(0.05, action_low=-1.0, action_high=1.0)
+    found = calibrate_filter(residuals, lacking, data, config)
+    assert found.inflation >= 8

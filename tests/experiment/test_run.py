@@ -22,10 +22,11 @@ from torchrl_l1.campaign.plan import plan
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.evaluate import evaluate, load_run
+from torchrl_l1.experiment.files import save_atomically
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.matrix import conditions
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.run_directory import RunDirectory, save_atomically
+from torchrl_l1.experiment.run_directory import RunDirectory
 
 METRICS = METRPO.facts.metrics
 

@@ -9,12 +9,13 @@ from pathlib import Path
 import pytest
 
 from torchrl_l1.experiment.errors import RunDirectoryInUse
-from torchrl_l1.experiment.run_directory import RunDirectory, commit, locked
+from torchrl_l1.experiment.files import locked
+from torchrl_l1.experiment.run_directory import RunDirectory, commit
 
 HOLD = """
 import subprocess, sys, time
 from pathlib import Path
-from torchrl_l1.experiment.run_directory import locked
+from torchrl_l1.experiment.files import locked
 with locked(Path(sys.argv[1])) as ours:
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     print(ours, child.pid, flush=True)

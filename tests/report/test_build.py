@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 import matplotlib.image
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
 from torchrl_l1.campaign.description import dump_yaml, read_campaign
 from torchrl_l1.cli import main
@@ -237,10 +239,78 @@ def test_bad_requests_are_refused_before_anything_is_written(
     nowhere = str(tmp_path / "nowhere.csv")
     message = refused(["report", str(runs), "--reference-curves", nowhere], capsys)
     assert "no reference curves at" in message
-    (runs / "campaign.yaml").write_text("runs: 3\n")
-    assert "is no campaign file" in refused(["report", str(runs)], capsys)
-    (runs / "campaign.yaml").unlink()
     (run / "metrics.csv").write_text("iteration,real_steps\n0,\n")
     assert str(run / "metrics.csv") in refused(["report", str(runs)], capsys)
     assert not (runs / "report").exists()
     assert not list(empty.iterdir())
+
+
+def test_settings_that_differ_in_hundreds_of_keys_make_a_report(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    write_run([-2, -1], "l1=off")
+    other = write_run([-3, -1], "l1=off", "preset=paper")
+    config = other / "config.yaml"
+    extra = "".join(f"a_setting_with_a_long_name_{i}: {i}\n" for i in range(300))
+    config.write_text(config.read_text() + extra)
+    page = report([tmp_path / "runs"])
+    text = page.read_text()
+    names = [file.name for file in page.parent.iterdir()]
+    assert max(map(len, names)) <= 130
+    assert re.search(r"## By \d+ settings\n", text)
+    assert "`a_setting_with_a_long_name_299`" in text
+    for figure in re.findall(r"!\[[^]]+]\(([^)]+)\)", text):
+        assert figure in names
+
+
+def test_every_file_that_cannot_be_read_is_listed(write_run: WriteRun, tmp_path: Path) -> None:
+    write_run([-2, -1], "l1=off", seed=0)
+    runs = [write_run([-2, -1], "l1=off", seed=seed) for seed in (1, 2, 3, 4, 5)]
+    (runs[0] / "versions.json").write_text("[1, 2]")
+    (runs[1] / "config.yaml").write_bytes(b"\xff\x00task: {")
+    bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
+        f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 12)
+    )
+    (runs[2] / "config.yaml").write_text(bomb + "task: x\nseed: 0\n")
+    (runs[3] / "config.yaml").write_text("task: " + "[" * 5000)
+    (runs[4] / "checksums.json").write_text('{"metrics.csv": {"2": "0000"}}')
+    (tmp_path / "runs" / "campaign.yaml").write_text("runs: 3\n")
+    text = report([tmp_path / "runs"]).read_text()
+    assert "2 runs, of which 2 are finished" in text
+    for run, words in zip(
+        runs,
+        (
+            "versions.json: it holds no names",
+            "config.yaml: ",
+            "config.yaml: ",
+            "config.yaml: it is nested too deeply",
+            "metrics.csv is not as it was written",
+        ),
+        strict=True,
+    ):
+        assert f"{run}/{words}" in text
+    assert "aliases that make it too large" in text
+    assert "is no campaign file" in text
+
+
+def test_text_from_files_is_text(write_run: WriteRun, tmp_path: Path) -> None:
+    evil = "<script>alert(1)</script> | `rm` ![x](http://y)\n\n# Head"
+    write_run([-2, -1], "l1=off")
+    run = write_run([-2, -1], "l1=off", "label=nominal")
+    config = OmegaConf.load(run / "config.yaml")
+    config.recipe = "=cmd()" + evil
+    OmegaConf.save(config, run / "config.yaml")
+    (run / "versions.json").write_text(json.dumps({evil: f"=1+1{evil}"}))
+    content = {"name": evil, "description": evil, "runs": [{"matrix": {"seed": [0]}}]}
+    (tmp_path / "runs" / "campaign.yaml").write_text(dump_yaml(content))
+    page = report([tmp_path / "runs"])
+    outside = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    for dangerous in ("<script", r"(?<!\\)\]\(http", "\n# Head", r"(?<!\\)`rm"):
+        assert not re.search(dangerous, outside)
+    for table in re.findall(r"(?:^\|.*\n)+", outside, re.MULTILINE):
+        widths = {len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()}
+        assert len(widths) == 1, table
+    for file in page.parent.glob("*.csv"):
+        with file.open() as handle:
+            for row in csv.reader(handle):
+                assert not any(cell.startswith(("=", "@", "+")) for cell in row), file

@@ -3,7 +3,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from torchrl_l1.experiment.run_directory import write_table
+from torchrl_l1.experiment.files import write_table
 from torchrl_l1.report.page import markdown
 
 

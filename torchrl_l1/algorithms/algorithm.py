@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from time import perf_counter
 from typing import Any, ClassVar, Protocol, TypedDict
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import nn
 
 from torchrl_l1.algorithms.collection import RETURN_METRICS, Collection, seed_streams
 from torchrl_l1.algorithms.config import ModelConfig, episode_length
@@ -20,7 +23,7 @@ from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.algorithms.model_learning import FIT_METRICS, ModelLearning, fit_metrics
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config
-from torchrl_l1.dynamics import FitConfig, make_dynamics
+from torchrl_l1.dynamics import FitConfig, calibrate_filter, make_dynamics
 from torchrl_l1.dynamics.network import model_precision
 from torchrl_l1.envs import Perturbation, get_task
 
@@ -49,12 +52,46 @@ COMMON_METRICS: dict[str, str] = {
 """What every algorithm logs."""
 
 
+class Diverged(ValueError):
+    """Something has become infinite or no number at all that training cannot go on from.
+
+    Attributes:
+        iteration: the outer iteration in which that happened.
+    """
+
+    def __init__(self, iteration: int, phase: str, what: str, setting: str) -> None:
+        super().__init__(
+            f"training diverged in iteration {iteration}, {phase}: {what}; look at {setting}"
+        )
+        self.iteration = iteration
+
+
+# What is finite in every round of a training that goes well, and the settings behind it if not.
+_FINITE = {
+    "model/": "fit.learning_rate, model.std_floor and the data's scale",
+    "clone/": "cloning.learning_rate",
+    "ppo/kl": "fine_tuning.learning_rate",
+    "ppo/value_loss": "fine_tuning.value_learning_rate",
+    "trpo/": "trpo.max_kl and policy.std",
+    "imagined/return": "imagined_horizon and model.box_margin",
+    "policy/": "policy.std",
+    "return_": "policy.std and the environment's rewards",
+}
+
+
 @dataclass
 class IterationResult:
-    """What an outer iteration reports: metrics, and wall-clock seconds by phase."""
+    """What an outer iteration reports.
+
+    Attributes:
+        metrics: by name.
+        seconds: wall-clock time by phase.
+        diverged: what went wrong in it, where :attr:`Algorithm.on_divergence` lets it go on.
+    """
 
     metrics: dict[str, float]
     seconds: dict[str, float]
+    diverged: list[Diverged] = field(default_factory=list)
 
 
 class AlgorithmConfig(Protocol):
@@ -102,6 +139,8 @@ class Algorithm(ABC):
         facts: what is known of the algorithm without running it.
         config_class: the class of its settings.
         iteration: outer iterations that are complete.
+        stops_on_divergence: whether to raise :class:`Diverged` where something is no longer
+            finite, or to note it in the result of the iteration.
         dynamics: the model.
         acting_dynamics: the model that L1 uses in real environments, on the CPU.
         learning: the model's data and fits.
@@ -128,7 +167,7 @@ class Algorithm(ABC):
         compile_l1: CompileMode = False,
         on_phase: Callable[[str], None] | None = None,
     ) -> None:
-        self.config, self.seed = config, seed
+        self.config, self.l1, self.seed = config, l1, seed
         self.device = resolve_device(device)
         self.on_phase = on_phase or (lambda phase: None)
         self.task = get_task(task)
@@ -136,6 +175,9 @@ class Algorithm(ABC):
         self.episode_steps = episode_length(config.episode_steps, self.horizon)
         self.iteration = 0
         self._seconds: dict[str, float] = {}
+        self._phase = ""
+        self._diverged: list[Diverged] = []
+        self.stops_on_divergence = True
 
         seed_streams(self.seed, "initialisation")
         model = vars(config.model)
@@ -170,6 +212,7 @@ class Algorithm(ABC):
         while self.iteration < self.config.outer_iterations:
             seed_streams(self.seed, "iteration", self.iteration)
             self._seconds = dict.fromkeys(self.facts.phases, 0.0)
+            self._diverged = []
             yield (iteration := self.iteration)
             if self.iteration == iteration:
                 raise RuntimeError("an outer iteration was not completed: call complete()")
@@ -182,7 +225,8 @@ class Algorithm(ABC):
             name: one of ``facts.phases``.
             words: on what is going on; those of the phase by default.
         """
-        self.on_phase(words or self.facts.phases[name].words)
+        self._phase = self.facts.phases[name].words
+        self.on_phase(words or self._phase)
         start = perf_counter()
         yield
         self._seconds[name] += perf_counter() - start
@@ -191,14 +235,80 @@ class Algorithm(ABC):
         """The phase in which the model is fitted to all real data; returns its metrics."""
         with self.phase("fit"):
             report = self.learning.fit(lambda epoch: self.on_phase(f"fit, epoch {epoch}"))
+            self._check_finite(fit_metrics(report))
+            self._check_weights("model", self.dynamics)
             self.acting_dynamics.load_state_dict(self.dynamics.state_dict())
+            self._calibrate_filter()
         return fit_metrics(report)
 
+    def _calibrate_filter(self) -> None:
+        """Where a Kalman filter acts, fit it to what the model misses now."""
+        if self.l1 is None or self.l1.filter != "kalman":
+            return
+        residuals = self.acting_dynamics.residuals
+        config = replace(
+            self.l1, action_low=self.task.action_low, action_high=self.task.action_high
+        )
+        calibrate_filter(
+            residuals,
+            self.acting_dynamics.value_and_jacobian,
+            self.learning.buffer[:],
+            config,
+            self.learning.action_key,
+        )
+        self.dynamics.residuals.load_state_dict(residuals.state_dict())
+
+    def diverged(self, what: str, setting: str) -> None:
+        """Stop the training, or note it and go on, see ``stops_on_divergence``.
+
+        Args:
+            what: has happened.
+            setting: that is likely to be the cause.
+
+        Raises:
+            Diverged: if the training stops.
+        """
+        error = Diverged(self.iteration, self._phase, what, setting)
+        if self.stops_on_divergence:
+            raise error
+        if str(error) not in map(str, self._diverged):
+            self._diverged.append(error)
+
+    def _check_finite(self, metrics: Mapping[str, float]) -> None:
+        for name, value in metrics.items():
+            for beginning, setting in _FINITE.items():
+                if name.startswith(beginning) and not math.isfinite(value):
+                    self.diverged(f"{name} is {value}", setting)
+
+    def _check_weights(self, name: str, module: nn.Module) -> None:
+        if not all(bool(part.isfinite().all()) for part in module.parameters()):
+            self.diverged(f"weights of the {name} are not finite", _FINITE["model/"])
+
+    def check_plans(self, data: TensorDictBase) -> None:
+        """Note it where no plan from a finite observation had a finite return.
+
+        Args:
+            data: collected by a planner, see ``ModelPredictiveController``.
+        """
+        plan = data["next", "plan", "best_return"].squeeze(-1)
+        lost = ~plan.isfinite() & data["observation"].isfinite().all(-1)
+        if bool(lost.any()):
+            self.diverged(
+                f"every sequence of a plan has an infinite imagined return, in {int(lost.sum())} "
+                f"of {lost.numel()} steps",
+                "fit.learning_rate, the planner's horizon and model.std_floor",
+            )
+
     def complete(self, real_steps: int, metrics: Mapping[str, float]) -> IterationResult:
-        """End the outer iteration after so many real steps in all."""
+        """End the outer iteration after so many real steps in all.
+
+        Raises:
+            Diverged: if a metric is not finite that should be.
+        """
+        self._check_finite(metrics)
         head = {"iteration": self.iteration, "real_steps": real_steps}
         self.iteration += 1
-        return IterationResult({**head, **metrics}, self._seconds)
+        return IterationResult({**head, **metrics}, self._seconds, self._diverged)
 
     def choices(self) -> dict[str, str]:
         """What settings that say ``auto`` have become on this machine."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl_l1.algorithms.mbmf_config import CloningConfig
 from torchrl_l1.algorithms.model_learning import TrainingData
 from torchrl_l1.algorithms.policy import GaussianPolicy
-from torchrl_l1.dynamics.fit import split_validation
+from torchrl_l1.dynamics.transitions import split_validation
 
 CLONING_METRICS: dict[str, str] = {
     "clone/train_loss": "Stage 2: mean squared difference between the policy's and the planner's "

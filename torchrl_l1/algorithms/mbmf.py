@@ -165,6 +165,7 @@ class MBMF(Algorithm):
         fit = self.fit()
         with self.phase("collect", "planning and collecting"):
             data = self.shooting.collect(self.seed, self.iteration)
+            self.check_plans(data)
             self.learning.store(data)
             # What follows in a plan that is a few steps old does not answer the state.
             planned = data[(data["plan", "step"] % self.config.replan_every == 0).squeeze(-1)]
@@ -213,14 +214,19 @@ class MBMF(Algorithm):
             data = self.practice.collect(self.seed, self.iteration)
         done = number * self.practice.frames / (config.anneal_steps or math.inf)
         with self.phase("tune"):
-            report = self.fine_tuning.step(data, min(done, 1.0))
+            try:
+                learned = self.fine_tuning.step(data, min(done, 1.0)).metrics()
+            except ValueError as error:
+                self.diverged(str(error), "fine_tuning.value_learning_rate")
+                learned = dict.fromkeys(FINE_TUNING_METRICS, math.nan)
+            self._check_weights("policy", self.policy)
         with self.phase("evaluate"):
             practice, measured = self.practice, self.policy_measured
             returns = policy_returns(data, practice, measured, self.seed, self.iteration)
         return {
             **returns,
             **signal_metrics(data),
-            **report.metrics(),
+            **learned,
             "policy/std": self.policy.log_std.detach().exp().mean().item(),
         }
 

@@ -120,7 +120,11 @@ class METRPO(Algorithm):
                 steps = []
                 for step in range(config.trpo_iterations):
                     self.on_phase(f"TRPO {step + 1}/{config.trpo_iterations}")
-                    steps.append(self.improvement.step(self.learning.buffer))
+                    try:
+                        steps.append(self.improvement.step(self.learning.buffer))
+                    except ValueError as error:
+                        self.diverged(str(error), "imagined_horizon, discount and policy.std")
+                self._check_weights("policy", self.policy)
 
             with self.phase("collect"):
                 self.acting_policy.load_state_dict(self.policy.state_dict())

@@ -23,7 +23,7 @@ FIT_METRICS: dict[str, str] = {
 class TrainingData:
     """All that has been seen so far, a fixed share of it kept out of training for good.
 
-    :func:`~torchrl_l1.dynamics.fit.split_validation` tells the two parts apart.
+    :func:`~torchrl_l1.dynamics.transitions.split_validation` tells the two parts apart.
 
     Args:
         capacity: items that there is room for.

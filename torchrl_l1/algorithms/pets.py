@@ -107,6 +107,7 @@ class PETS(Algorithm):
 
             with self.phase("collect"):
                 data = self.collection.collect(self.seed, iteration)
+                self.check_plans(data)
                 self.learning.store(data)
 
             with self.phase("evaluate"):

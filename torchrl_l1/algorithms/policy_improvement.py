@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
@@ -133,7 +134,12 @@ class PolicyImprovement:
 
 
 def policy_metrics(steps: list[PolicyStep]) -> dict[str, float]:
-    """Metrics of the policy's improvement: all TRPO steps of an outer iteration."""
+    """Metrics of the policy's improvement: all TRPO steps of an outer iteration.
+
+    They are no numbers where not one step could be taken.
+    """
+    if not steps:
+        return dict.fromkeys(POLICY_METRICS, math.nan)
     reports = [step.report for step in steps]
     return {
         "imagined/return_first": steps[0].imagined_return,

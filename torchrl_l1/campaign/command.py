@@ -21,7 +21,7 @@ from torchrl_l1.campaign.plan import check_devices, plan
 from torchrl_l1.campaign.progress import overview
 from torchrl_l1.campaign.reuse import copy_run, find_reusable
 from torchrl_l1.campaign.workers import Stopped, available_cores
-from torchrl_l1.experiment.run_directory import locked, write_atomically
+from torchrl_l1.experiment.files import locked, write_atomically
 
 
 def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> None:
@@ -38,11 +38,13 @@ def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> N
         raise CampaignError(f"{for_hydra[0]} is for Hydra's launchers; give --launcher as well")
     if options.launcher:
         check_launcher(options.launcher)
-    campaign = read_campaign(options.campaign, [o for o in overrides if o not in for_hydra])
+    ours = [text for text in overrides if text not in for_hydra]
+    campaign = read_campaign(options.campaign, ours, trusted=options.trust)
+    for_hydra += ["--trust"] if options.trust else []
     output = Path(options.output or f"runs/campaigns/{campaign.name}").resolve()
     _check_owner(output, campaign)
     # Runs that are reused need no device, so devices are checked once these are known.
-    runs = plan(campaign, output)
+    runs = plan(campaign, output, trusted=options.trust)
     reused = find_reusable(runs, output, [Path(folder) for folder in options.reuse])
     if not (options.launcher and elsewhere(options.launcher)):
         check_devices(campaign, [run for run in runs if run.directory.path not in reused])

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 import yaml  # type: ignore[import-untyped]
 
+from torchrl_l1.experiment.files import problem, yaml_text
 from torchrl_l1.experiment.matrix import (
     SUITE_L1,
     Axis,
@@ -64,13 +65,14 @@ def load_yaml(file: Path) -> Any:
     """The content of a YAML file.
 
     Raises:
-        ValueError: if it cannot be read as YAML, with the place.
+        OSError: if it cannot be read.
+        ValueError: if it is no YAML, with the place, or too large.
     """
     try:
-        with file.open(encoding="utf-8") as handle:
-            return yaml.load(handle, _Loader)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{file} is not valid YAML: {error}") from error
+        return yaml.load(yaml_text(file), _Loader)
+    # Tags with impossible values and keys that are lists have errors of their own.
+    except (yaml.YAMLError, RecursionError, TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"{file} is not valid YAML: {problem(error)}") from error
 
 
 def dump_yaml(content: Any) -> str:
@@ -86,7 +88,11 @@ def dump_yaml(content: Any) -> str:
 
 
 # What may become part of a path and of a Hydra override without quotes.
-_PLAIN = re.compile(r"[A-Za-z0-9_.+-]+")
+_PLAIN = re.compile(r"[A-Za-z0-9_.+-]{1,100}")
+# Keys too; a group may be below another one.
+_KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:[./@-][A-Za-z0-9_]+)*")
+# Of a campaign, whose default is that of a user's file.
+_NAME = re.compile(r"[\w+][\w.+=, -]{0,99}")
 _RESERVED = ("run_dir", "resume")
 
 
@@ -113,6 +119,8 @@ class RunMatrix:
         if not isinstance(self.matrix, dict):
             raise CampaignError(f"matrix must map keys to lists of values, got {self.matrix!r}")
         for key, values in self.matrix.items():
+            if not _KEY.fullmatch(str(key)) or len(str(key)) > 100:
+                raise CampaignError(f"matrix: {key!r} is no key of a recipe")
             _check_list(f"matrix.{key}", values, (str, int, float), filled=True)
             texts = [value_text(value) for value in values]
             for text in texts:
@@ -304,12 +312,13 @@ def _check_list(
 T = TypeVar("T")
 
 
-def read_campaign(name: str, overrides: Sequence[str] = ()) -> Campaign:
+def read_campaign(name: str, overrides: Sequence[str] = (), *, trusted: bool = False) -> Campaign:
     """Read a shipped campaign or a YAML file of the user's.
 
     Args:
         name: such as ``table1``, or a path that ends in ``.yaml``.
         overrides: Hydra overrides for all runs; they replace those of the file with the same key.
+        trusted: whether the file may set up Hydra itself, which may run any code.
 
     Raises:
         RecipeError: if there is no such campaign.
@@ -339,6 +348,12 @@ def read_campaign(name: str, overrides: Sequence[str] = ()) -> Campaign:
     ]
     for i, matrix in enumerate(runs):
         own = file.parent / str(matrix.recipe)
+        for key in [*matrix.matrix, *map(override_key, matrix.overrides)]:
+            if re.match(r"hydra\b", key) and not trusted:
+                raise CampaignError(
+                    f"{file}: runs[{i}]: {key} sets up Hydra, by which any code may be run; leave "
+                    "it out, or say --trust if the file is yours"
+                )
         try:
             runs[i] = RunMatrix(
                 str(own.resolve()) if own.suffix == ".yaml" and own.is_file() else matrix.recipe,
@@ -356,7 +371,12 @@ def read_campaign(name: str, overrides: Sequence[str] = ()) -> Campaign:
         )
         for i, entry in enumerate(content.get("evaluations", []))
     ]  # fmt: skip
-    title = str(content.get("name", file.stem))
+    title = content.get("name", file.stem)
+    if not isinstance(title, str) or not _NAME.fullmatch(title):
+        raise CampaignError(
+            f"{file}: name must be letters, digits, spaces and . + = , - that begin with a letter, "
+            f"at most 100, since it names a folder; got {title!r}"
+        )
     return Campaign(title, file, str(content.get("description", "")), runs, evaluations)
 
 

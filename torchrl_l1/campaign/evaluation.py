@@ -8,8 +8,9 @@ from typing import Any
 
 from torchrl_l1.campaign.description import EvaluationSettings, dump_yaml, load_yaml
 from torchrl_l1.experiment.evaluate import distinct, episodes_file, evaluate_episodes, load_run
+from torchrl_l1.experiment.files import refuse_link, write_atomically, write_table
 from torchrl_l1.experiment.matrix import suite
-from torchrl_l1.experiment.run_directory import RunDirectory, write_atomically, write_table
+from torchrl_l1.experiment.run_directory import RunDirectory
 
 
 def evaluation_file(run_dir: Path, name: str) -> Path:
@@ -66,13 +67,15 @@ def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
         ValueError: for a stage that the run has not; nothing is changed then.
     """
     chosen = EvaluationSettings.from_keys(name=name, **settings)
-    trained = load_run(run_dir)
+    table = evaluation_file(Path(run_dir), name)
+    for folder in (table.parent, episodes_file(table).parent):
+        refuse_link(folder)
+    trained = load_run(run_dir, last=True)
     cells = distinct(trained, chosen.conditions())
     rows, episodes = [], []
     for row, single in evaluate_episodes(trained, cells, chosen.episodes, chosen.seed):
         rows.append(row)
         episodes += single
-    table = evaluation_file(Path(run_dir), name)
     described = table.with_suffix(".yaml")
     singly = episodes_file(table)
     singly.parent.mkdir(parents=True, exist_ok=True)

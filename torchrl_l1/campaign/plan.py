@@ -29,7 +29,7 @@ from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run import check_wandb_mode
 from torchrl_l1.experiment.run_directory import RunDirectory
-from torchrl_l1.experiment.settings import SCHEMAS, RunSettings, l1_config
+from torchrl_l1.experiment.settings import SCHEMAS, RunSettings, check_known, l1_config
 
 
 @dataclass
@@ -83,8 +83,8 @@ class PlannedRun:
         return min(self.directory.iterations_done(), self.iterations)
 
     def finished(self) -> bool:
-        """Whether all outer iterations are done."""
-        return self.iterations_done() >= self.iterations
+        """Whether all outer iterations are done, and their files are as they were written."""
+        return self.iterations_done() >= self.iterations and self.directory.intact()
 
     def settings(self) -> dict[str, Any]:
         """The configuration as plain dictionaries, lists and values."""
@@ -110,7 +110,10 @@ class PlannedRun:
     def problem(self) -> str | None:
         """What keeps the run from being finished as planned; ``None`` if it is."""
         if not self.finished():
-            return f"{self} has {self.iterations_done()} of {self.iterations} iterations"
+            done = self.iterations_done()
+            if done >= self.iterations:
+                return f"{self} has files that are not as they were written"
+            return f"{self} has {done} of {self.iterations} iterations"
         try:
             self.check_directory()
         except RunDirectoryError as error:
@@ -133,7 +136,7 @@ def quoted(path: Path) -> str:
     return "'" + str(path).replace("'", "\\'") + "'"
 
 
-def plan(campaign: Campaign, output: Path) -> list[PlannedRun]:
+def plan(campaign: Campaign, output: Path, *, trusted: bool = False) -> list[PlannedRun]:
     """All runs of a campaign, in the order in which they are to be started.
 
     The first seed of every cell comes before the second of any, so that a campaign that is
@@ -142,6 +145,7 @@ def plan(campaign: Campaign, output: Path) -> list[PlannedRun]:
     Args:
         campaign: the campaign.
         output: its folder.
+        trusted: whether recipes of the user's may set up Hydra itself.
 
     Raises:
         CampaignError: for an unknown recipe or option, a setting out of range, an evaluation that
@@ -151,7 +155,7 @@ def plan(campaign: Campaign, output: Path) -> list[PlannedRun]:
     runs: list[PlannedRun] = []
     for i, matrix in enumerate(campaign.runs):
         try:
-            runs += _runs(i, matrix, output.resolve())
+            runs += _runs(i, matrix, output.resolve(), trusted)
         except USER_ERRORS as error:
             raise CampaignError(f"{campaign.file}: runs[{i}]: {message(error)}") from error
     for path, count in Counter(run.directory.path for run in runs).items():
@@ -173,12 +177,13 @@ def cells(matrix: RunMatrix) -> Iterator[dict[str, str]]:
         yield dict(zip(keys, map(value_text, values), strict=True))
 
 
-def _runs(index: int, matrix: RunMatrix, output: Path) -> Iterator[PlannedRun]:
+def _runs(index: int, matrix: RunMatrix, output: Path, trusted: bool) -> Iterator[PlannedRun]:
     recipe = matrix.recipe
     for cell in cells(matrix):
         place = [f"{key}={text}" for key, text in cell.items()]
         folder = output.joinpath(recipe_name(recipe), *place)
-        config = compose(recipe, [*matrix.overrides, *place, f"run_dir={quoted(folder)}"])
+        overrides = [*matrix.overrides, *place, f"run_dir={quoted(folder)}"]
+        config = compose(recipe, overrides, trusted=trusted)
         _check(config)
         for round_, seed in enumerate(matrix.matrix["seed"]):
             own = config.copy()
@@ -194,12 +199,9 @@ def _runs(index: int, matrix: RunMatrix, output: Path) -> Iterator[PlannedRun]:
 
 
 def _check(config: DictConfig) -> None:
+    check_known(config)
     recipe = OmegaConf.to_object(config)
-    if not isinstance(recipe, RunSettings):
-        raise ValueError(
-            "the recipe has no schema; put that of its algorithm, such as metrpo_recipe, first in "
-            "its defaults"
-        )
+    assert isinstance(recipe, RunSettings)
     get_task(recipe.task)
     l1_config(recipe.l1, recipe.task)
     check_mode(recipe.l1.compile, "l1.compile")

@@ -17,11 +17,13 @@ REFRESH_SECONDS = 2.0
 
 
 def state(run: PlannedRun) -> str:
-    """One of ``waiting``, ``K of N iterations`` and ``finished``, with evaluations if any."""
+    """``waiting``, ``K of N iterations``, ``damaged`` or ``finished``, with evaluations if any."""
     done = run.iterations_done()
     if done < run.iterations:
         started = run.directory.config_file.exists()
         return f"{done} of {run.iterations} iterations" if started else "waiting"
+    if not run.finished():
+        return "damaged"
     if not run.evaluations:
         return "finished"
     evaluated = sum(is_evaluated(run.directory, settings) for settings in run.evaluations)

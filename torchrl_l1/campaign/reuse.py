@@ -12,13 +12,14 @@ from omegaconf import OmegaConf
 
 from torchrl_l1.campaign.description import CampaignError
 from torchrl_l1.campaign.plan import PlannedRun
+from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.evaluate import episodes_file
+from torchrl_l1.experiment.files import write_atomically
 from torchrl_l1.experiment.run_directory import (
     RunDirectory,
     differences,
     read_config,
     run_directories,
-    write_atomically,
 )
 
 
@@ -71,8 +72,8 @@ def copy_run(source: Path, run: PlannedRun) -> None:
     temporary = target.with_name(f".{target.name}.copy")
     try:
         shutil.rmtree(temporary, ignore_errors=True)
-        ignored = shutil.ignore_patterns(".lock", "*.tmp")
-        shutil.copytree(source, temporary, symlinks=True, ignore=ignored)
+        # What links lead to is copied, so that nothing is ever changed through them.
+        shutil.copytree(source, temporary, ignore=_left, ignore_dangling_symlinks=True)
         copy = RunDirectory(temporary)
         config = read_config(copy.config_file)
         if not _finished(copy, config) or differences(config, run.settings()):
@@ -83,9 +84,19 @@ def copy_run(source: Path, run: PlannedRun) -> None:
         if target.exists() and run.directory.free():
             shutil.rmtree(target)
         temporary.rename(target)
-    except OSError as error:
+    except (OSError, RunDirectoryError) as error:
         shutil.rmtree(temporary, ignore_errors=True)
         raise CampaignError(f"cannot copy {source} to {target}: {error}") from error
+
+
+def _left(folder: str, names: list[str]) -> set[str]:
+    """Locks, what was being written, links to folders, and what is neither file nor folder."""
+    found = set(shutil.ignore_patterns(".lock", "*.tmp")(folder, names))
+    for name in names:
+        path = Path(folder, name)
+        if path.is_dir() if path.is_symlink() else not (path.is_file() or path.is_dir()):
+            found.add(name)
+    return found
 
 
 def _key(config: Mapping[str, Any]) -> tuple[Any, ...]:
@@ -94,7 +105,7 @@ def _key(config: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def _finished(directory: RunDirectory, config: Mapping[str, Any]) -> bool:
-    return directory.iterations_done() == config.get("outer_iterations")
+    return directory.iterations_done() == config.get("outer_iterations") and directory.intact()
 
 
 def _keep_evaluations(source: Path, copy: Path, wanted: Set[str]) -> None:

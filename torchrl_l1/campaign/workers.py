@@ -13,9 +13,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
+from torchrl_l1.experiment.errors import RunDirectoryError, message
+from torchrl_l1.experiment.files import refuse_link
+
 # A process that found another one at its work; EX_TEMPFAIL, a name that Windows does not have.
 TEMPORARY_FAILURE = 75
 POLL_SECONDS = 0.1
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
+_STOPPING = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
 GRACE_SECONDS = 10.0
 _LAST_LINES = 15
 
@@ -58,7 +63,10 @@ class Failure:
 
     def __str__(self) -> str:
         """Name, how it ended, and the end of the log."""
-        lines = self.job.log.read_text(encoding="utf-8", errors="replace").splitlines()
+        try:
+            lines = self.job.log.read_text(encoding="utf-8", errors="replace").splitlines()
+        except OSError:
+            return f"{self.job.name} {self.how}; there is no log"
         tail = "\n".join(f"    {line}" for line in lines[-_LAST_LINES:])
         return f"{self.job.name} {self.how}; the end of {self.job.log}:\n{tail}"
 
@@ -108,7 +116,7 @@ class Workers:
             the jobs that ended badly; the others went on.
 
         Raises:
-            Stopped: after SIGINT or SIGTERM, once every process has ended.
+            Stopped: after SIGINT, SIGTERM, SIGHUP or SIGUSR1, once every process has ended.
         """
         self._queue.extend(jobs)
         with self._signals():
@@ -128,23 +136,34 @@ class Workers:
         for job in list(self._queue):
             if len(self._running) >= self.count:
                 break
-            if job.held():
-                if id(job) not in self._waiting:
-                    self._waiting.add(id(job))
-                    self._on_wait(job)
-                continue
-            self._queue.remove(job)
-            job.log.parent.mkdir(parents=True, exist_ok=True)
-            with job.log.open("ab") as log:
-                process = subprocess.Popen(
-                    job.command,
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
-                    stderr=subprocess.STDOUT,
-                    env={**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
-                    start_new_session=True,
-                )
-            self._running.append((job, process))
+            try:
+                if job.held():
+                    if id(job) not in self._waiting:
+                        self._waiting.add(id(job))
+                        self._on_wait(job)
+                    continue
+                self._queue.remove(job)
+                process = self._process(job)
+            except (OSError, RunDirectoryError) as error:
+                # It cannot even have a log; the others may.
+                if job in self._queue:
+                    self._queue.remove(job)
+                self._failures.append(Failure(job, f"could not be started: {message(error)}"))
+            else:
+                self._running.append((job, process))
+
+    def _process(self, job: Job) -> subprocess.Popen[bytes]:
+        job.log.parent.mkdir(parents=True, exist_ok=True)
+        refuse_link(job.log)
+        with job.log.open("ab") as log:
+            return subprocess.Popen(
+                job.command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
+                start_new_session=True,
+            )
 
     def _collect(self) -> None:
         for entry in list(self._running):
@@ -181,7 +200,7 @@ class Workers:
         def note(signal_number: int, frame: FrameType | None) -> None:
             self._stop = signal_number
 
-        before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+        before = {number: signal.signal(number, note) for number in _STOPPING}
         try:
             yield
         finally:

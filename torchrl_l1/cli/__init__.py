@@ -1,4 +1,4 @@
-"""The command ``torchrl-l1``: run, campaign, evaluate, report, verify."""
+"""The command ``torchrl-l1``: run, campaign, evaluate, robustify, play, export, report, verify."""
 
 from __future__ import annotations
 
@@ -6,8 +6,32 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 
 DESCRIPTION = "Robust model-based reinforcement learning with L1 adaptive control."
+
+_TRUST = "let the file set up Hydra itself, which may run any code"
+
+
+_DEPLOYMENT = (
+    (
+        "robustify",
+        "put L1 around a policy of any origin, and test it under disturbances",
+        "Collects data with the policy, fits a model, calibrates L1, and tests the policy under "
+        "disturbances with L1 off and on and with an oracle.",
+    ),
+    (
+        "play",
+        "show a policy in a window or a film, with L1 off or on",
+        "Plays an episode of a run, of a robust controller or of a policy in its environment.",
+    ),
+    (
+        "export",
+        "write policy and L1 as one function of observation and state",
+        "Writes a robust controller as TorchScript, ONNX or an exported program of torch, and "
+        "compares it with the original on steps of the environment.",
+    ),
+)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -18,6 +42,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     _run_parser(commands)
     _campaign_parser(commands)
     _evaluate_parser(commands, asked="evaluate" in arguments[:1])
+    for name, words, description in _DEPLOYMENT:
+        parts = commands.add_parser(name, help=words, description=description)
+        # What their options come with is heavy; no other command should wait for it.
+        if name in arguments[:1]:
+            import_module(f"torchrl_l1.cli.{name}").add_arguments(parts)
     _report_parser(commands)
     verify = commands.add_parser(
         "verify", help="replay recorded traces of a reference controller in float64"
@@ -31,6 +60,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     if rest and options.command != "run" and not overridden:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     # Imports wait until the arguments are known to be right: torch takes seconds to load.
+    from torchrl_l1.experiment.signals import orderly_end
+
+    with orderly_end():
+        _dispatch(options, rest)
+
+
+def _dispatch(options: argparse.Namespace, rest: list[str]) -> None:
     from torchrl_l1.experiment.errors import USER_ERRORS, message
 
     try:
@@ -44,6 +80,9 @@ def main(argv: Sequence[str] | None = None) -> None:
             from torchrl_l1.cli.evaluate import evaluate_command
 
             evaluate_command(options)
+        elif options.command in [name for name, *_ in _DEPLOYMENT]:
+            chosen = import_module(f"torchrl_l1.cli.{options.command}")
+            getattr(chosen, f"{options.command}_command")(options)
         elif options.command == "report":
             from torchrl_l1.report.build import report_command
 
@@ -61,7 +100,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
         print(f"torchrl-l1 {options.command}: {message(error)}", file=sys.stderr)
-        print("(HYDRA_FULL_ERROR=1 shows where it was raised)", file=sys.stderr)
+        if isinstance(error, BrokenPipeError):
+            # Nothing more can be written there, not even when the interpreter ends.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
 
 
@@ -74,6 +115,7 @@ def _run_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     )
     run.add_argument("recipe", help="such as metrpo/inverted_pendulum, or a YAML file of yours")
     run.add_argument("--resume", action="store_true", help="continue from the last checkpoint")
+    run.add_argument("--trust", action="store_true", help=_TRUST)
 
 
 def _campaign_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -99,6 +141,7 @@ def _campaign_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
         metavar="DIR",
         help="copy finished runs with the same settings from these folders or below them",
     )
+    add("--trust", action="store_true", help=_TRUST)
     add("--launcher", help="hand the runs to one of Hydra's launchers, such as joblib")
 
 
@@ -135,4 +178,5 @@ def _report_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]
 def _run(options: argparse.Namespace, overrides: list[str]) -> None:
     from torchrl_l1.experiment.launch import launch
 
-    launch(options.recipe, overrides + (["resume=true"] if options.resume else []))
+    flags = ["--trust"] if options.trust else []
+    launch(options.recipe, overrides + flags + (["resume=true"] if options.resume else []))

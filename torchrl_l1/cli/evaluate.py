@@ -26,6 +26,7 @@ from torchrl_l1.experiment.evaluate import (
     load_run,
     make_collection,
 )
+from torchrl_l1.experiment.files import refuse_link, write_table
 from torchrl_l1.experiment.l1_options import check_tested
 from torchrl_l1.experiment.matrix import (
     SUITE_L1,
@@ -37,7 +38,6 @@ from torchrl_l1.experiment.matrix import (
     conditions,
 )
 from torchrl_l1.experiment.recipes import group_setting
-from torchrl_l1.experiment.run_directory import write_table
 from torchrl_l1.experiment.settings import RunSettings, WandbSettings
 from torchrl_l1.report.evaluation_figures import RANGES, plot_disturbances
 from torchrl_l1.report.evaluation_summary import summarize, summary_tables
@@ -146,7 +146,14 @@ def _check_one_study(runs: Sequence[TrainedRun]) -> None:
     """Runs may differ in their seed and in nothing that matters."""
 
     def settings(trained: TrainedRun) -> RunSettings:
-        return replace(trained.recipe, seed=0, run_dir="", resume=False, wandb=WandbSettings())
+        return replace(
+            trained.recipe,
+            seed=0,
+            run_dir="",
+            resume=False,
+            wandb=WandbSettings(),
+            on_divergence="stop",
+        )
 
     for trained in runs[1:]:
         if settings(trained) != settings(runs[0]):
@@ -211,6 +218,9 @@ def evaluate_command(options: argparse.Namespace) -> None:
     values["stage"] = _stages(runs, options.stage)
     cells = distinct(runs[0], conditions(options.suite, **values))
     output = Path(options.output) if options.output else runs[0].path / "evaluation"
+    if not options.output:
+        refuse_link(output)
+    output.mkdir(parents=True, exist_ok=True)
     rows, episodes = [], []
     total = len(runs) * len(cells)
     with tqdm(total=total, desc="evaluate", unit="cell", disable=None) as progress:
@@ -220,7 +230,6 @@ def evaluate_command(options: argparse.Namespace) -> None:
                 episodes += single
                 progress.update()
 
-    output.mkdir(parents=True, exist_ok=True)
     summary = summarize(rows, episodes)
     print(f"\n{runs[0].recipe.task}: {summary_tables(summary)}\n")
     tables = {"evaluation": rows, "episodes": episodes, "summary": summary}

@@ -12,12 +12,14 @@ from torchrl_l1.control.affine import (
     switching_law,
 )
 from torchrl_l1.control.affinizer import Affinizer
+from torchrl_l1.control.calibration import Calibration, calibrate
 from torchrl_l1.control.config import L1Config
-from torchrl_l1.control.controller import L1Controller
+from torchrl_l1.control.controller import L1Controller, L1Primer
 from torchrl_l1.control.jacobian import ActionJacobian, DynamicsModel
 from torchrl_l1.control.law import step
 from torchrl_l1.control.least_squares import solve_matched
 from torchrl_l1.control.oracle import OracleTransform
+from torchrl_l1.control.pipeline import time_step
 from torchrl_l1.control.state import L1Diagnostics, L1State, ResidualStatistics, init
 from torchrl_l1.control.transform import L1Transform
 
@@ -26,18 +28,22 @@ __all__ = [
     "AffineModel",
     "Affinization",
     "Affinizer",
+    "Calibration",
     "DynamicsModel",
     "L1Config",
     "L1Controller",
     "L1Diagnostics",
+    "L1Primer",
     "L1State",
     "L1Transform",
     "OracleTransform",
     "ResidualStatistics",
     "affinize",
     "augment",
+    "calibrate",
     "init",
     "solve_matched",
     "step",
     "switching_law",
+    "time_step",
 ]

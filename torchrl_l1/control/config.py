@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any, Literal, get_args
 
+import torch
+
 from torchrl_l1.checks import check_choice
 
 OnSwitch = Literal["keep", "reset"]
@@ -57,9 +59,9 @@ class L1Config:
             ``"policy"``.
         filter_input: the estimate that the filter takes in: the ``"previous"`` step's, as in
             the paper's control law, or the ``"current"`` one, as the released code.
-        action_low: lower bound of the executed action, a number or one per action dimension;
-            ``None`` for no bound.
-        action_high: upper bound of the executed action.
+        action_low: lower bound of the executed action: a number, or a list, array or tensor with
+            one per action dimension, or the bounded spec of the action; ``None`` for no bound.
+        action_high: upper bound of the executed action, likewise.
         project: whether the matched estimate that enters the filter is projected, entry by
             entry, onto ``[action_low - action_high, action_high - action_low]`` where both are
             finite. No action cancels a larger matched disturbance, and where the actions have
@@ -81,7 +83,7 @@ class L1Config:
             filter's estimate is not acted on; 0 acts on all of it.
         process_noise: standard deviation of the disturbance's change per step, as a fraction
             of half the range of the action (of one action unit without bounds). If ``None``, what
-            the model says of itself, or else 0.003.
+            the model says of itself, see :func:`~torchrl_l1.control.calibrate`, or else 0.01.
         inflation: factor on the covariance, since residuals are neither white nor normal. If
             ``None``, what the model says of itself, or else 1.
         initial_deviation: standard deviation of the disturbance at a reset, in the units of
@@ -126,8 +128,11 @@ class L1Config:
     max_error: float = 1e8
 
     def __post_init__(self) -> None:
+        # What NumPy and torch call a number, an array or a truth value becomes Python's.
+        object.__setattr__(self, "project", _as_number(self.project))
         for name in _NUMBERS:
-            value = getattr(self, name)
+            value = _as_number(getattr(self, name))
+            object.__setattr__(self, name, value)
             if value is not None and not (_is_real(value) and math.isfinite(value)):
                 raise ValueError(f"{name} must be a finite number, got {value!r}")
         if self.dt < 1e-15:
@@ -233,11 +238,10 @@ class L1Config:
         """Kalman filter on covariance-weighted residuals, acting on what is significant.
 
         Not in the paper: it answers its open question about the covariance of probabilistic
-        models. The covariance is taken three times, since residuals of neighbouring steps are
-        alike: the smallest of 1, 3, 10 and 30 that left undisturbed METRPO policies of Hopper and
-        Walker (seed 1) alone.
+        models. Inflation and process noise are those of the model, found by
+        :func:`~torchrl_l1.control.calibrate` where there are undisturbed episodes.
         """
-        robust: dict[str, Any] = {"estimator": "weighted", "filter": "kalman", "inflation": 3.0}
+        robust: dict[str, Any] = {"estimator": "weighted", "filter": "kalman"}
         return cls(dt, **(robust | settings))
 
     @property
@@ -312,13 +316,39 @@ def _is_real(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
+def _as_number(value: Any) -> Any:
+    """A number of NumPy's or torch's, or an array with one, as Python's; the rest as it is."""
+    if type(value) in (int, float, bool) or not hasattr(value, "item"):
+        return value
+    return value.item() if math.prod(getattr(value, "shape", ())) == 1 else value
+
+
 def _as_scalars(name: str, value: Any) -> Scalars | None:
     if value is None:
         return None
+    value = _as_list(name, value)
     entries = value if isinstance(value, Sequence) and not isinstance(value, str) else (value,)
+    entries = [_as_number(entry) for entry in entries]
     if not entries or not all(_is_real(entry) and not math.isnan(entry) for entry in entries):
         raise ValueError(f"{name} must be a number or a non-empty list of numbers, got {value!r}")
-    return float(value) if entries == (value,) else tuple(float(entry) for entry in entries)
+    scalar = not isinstance(value, Sequence)
+    return float(entries[0]) if scalar else tuple(float(entry) for entry in entries)
+
+
+def _as_list(name: str, value: Any) -> Any:
+    """Bounds of specs, arrays and tensors as a list; of a batch, if all its rows are the same."""
+    if name != "a_s":
+        space = getattr(value, "space", value)
+        value = getattr(space, name.removeprefix("action_"), value)
+    if not hasattr(value, "tolist"):
+        return value
+    array = torch.as_tensor(value)
+    if array.ndim < 2:
+        return array.tolist()
+    rows = array.reshape(-1, array.shape[-1])
+    if not len(rows) or (rows != rows[0]).any():
+        raise ValueError(f"{name} must have the same entries for all environments, got {value!r}")
+    return rows[0].tolist()
 
 
 def _tuple(value: Scalars) -> tuple[float, ...]:

@@ -2,28 +2,199 @@
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
-from torchrl.data import Composite
-from torchrl.envs.transforms import TensorDictPrimer
+from tensordict.utils import NestedKey, unravel_key
+from torchrl.data import Composite, TensorSpec
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import TensorDictPrimer, Transform
 
 from torchrl_l1.compilation import CompileMode
-from torchrl_l1.control.affine import make_step
-from torchrl_l1.control.config import L1Config
+from torchrl_l1.control.affine import StepFunction, make_step
+from torchrl_l1.control.config import L1Config, Scalars
 from torchrl_l1.control.jacobian import Predicts
 from torchrl_l1.control.layout import (
     L1_KEY,
     Dynamics,
     Layout,
+    action_bounds,
     advance,
-    as_action_jacobian,
     declared_dimension,
+    required_entry,
 )
-from torchrl_l1.control.state import state_names
+from torchrl_l1.control.pipeline import (
+    Settings,
+    as_model,
+    carry,
+    check_time_step,
+    leaf_spec,
+    unspecified,
+    widen_selection,
+)
+from torchrl_l1.control.seal import SEAL, Emitted, sealed
+from torchrl_l1.control.state import L1Diagnostics, L1State, state_names
+
+
+class _Environment:
+    """What a controller knows of its environment: told by the primers that it made."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.is_known = False
+        self.low: Scalars | None = None
+        self.high: Scalars | None = None
+        self.emitted: Emitted | None = None
+        self._filled: tuple[L1Config, L1Config] | None = None
+
+    @property
+    def config(self) -> L1Config:
+        """The settings, with open bounds filled."""
+        config = self.settings.config
+        if self._filled is None or self._filled[0] is not config:
+            self._filled = config, self._fill(config)
+        return self._filled[1]
+
+    def _fill(self, config: L1Config) -> L1Config:
+        low = self.low if config.action_low is None else config.action_low
+        high = self.high if config.action_high is None else config.action_high
+        return replace(config, action_low=low, action_high=high)
+
+    def learn(self, low: Scalars | None, high: Scalars | None) -> None:
+        """Take the bounds of an environment.
+
+        Raises:
+            ValueError: if another has other ones.
+        """
+        if self.is_known and (low, high) != (self.low, self.high):
+            raise ValueError(
+                "the primers of one L1Controller are in environments with different action bounds: "
+                "give it action_spec, or action_low and action_high"
+            )
+        self.low, self.high, self.is_known = low, high, True
+        self._filled = None
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _Environment:
+        # Copies of a policy, which collectors make, act in the same environment.
+        return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"emitted": None}
+
+
+class L1Primer(TensorDictPrimer):
+    """Starts the state of an :class:`L1Controller` at each reset and carries it on.
+
+    Made by :meth:`L1Controller.make_primer`. It seals each observation and state, for the
+    controller to check, and tells the controller the environment's action bounds and time step.
+
+    Raises:
+        ValueError: at a reset, if the controller's ``dt`` is not the environment's.
+        KeyError: at a step, if the observation is missing, or what the controller wrote.
+    """
+
+    def __init__(
+        self,
+        environment: _Environment,
+        layout: Layout,
+        observation_key: NestedKey,
+        action_key: NestedKey,
+        key: str,
+        diagnostics: bool,
+        check_dt: bool,
+    ) -> None:
+        config = environment.settings.config
+        super().__init__(Composite({key: layout.state_spec(config)}), expand_specs=True)
+        self._shared = environment
+        self._signals = layout.signal_spec(diagnostics)
+        self.observation_key = unravel_key(observation_key)
+        self.action_key = unravel_key(action_key)
+        self.key = key
+        self.check_dt = check_dt
+        self._state_names = state_names(config)
+        self._is_checked = False
+        self._lacking: list[str] | None = None
+
+    def empty_cache(self) -> None:
+        """Forget what the environment told: a transform may have come or gone."""
+        self._is_checked = False
+        self._lacking = None
+        super().empty_cache()
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        """Attach to an environment."""
+        super().set_container(container)
+        names = (*self._state_names, SEAL, "u_exec", *L1Diagnostics._fields)
+        widen_selection(self, self.key, names)
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        """Add the controller's state and signals."""
+        output_spec = super().transform_output_spec(output_spec)
+        observation_spec = output_spec["full_observation_spec"]
+        signals = self._signals.expand(observation_spec.shape).to(observation_spec.device)
+        observation_spec[self.key].update(signals)
+        return output_spec
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        nested = next_tensordict.get(self.key, None)
+        if nested is None or nested.get(self._state_names[0], None) is None:
+            nested = self._without_controller(tensordict)
+        # The controller knew nothing of the observation to come.
+        nested = nested.clone(False)
+        self._seal(nested, next_tensordict)
+        return next_tensordict.set(self.key, nested)
+
+    def _post_step_mdp_hooks(
+        self, tensordict: TensorDictBase, tensordict_: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        if self._lacking is None:
+            self._lacking = unspecified(self, self.key, (*self._state_names, SEAL))
+        carry(self._lacking, "L1Controller's primer", self.key, tensordict, tensordict_)
+        return tensordict, tensordict_
+
+    def _without_controller(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if tensordict.get((self.key, "u_rl"), None) is not None:
+            raise KeyError(
+                f"L1Controller's primer found nothing under {('next', self.key)}: what the "
+                "controller wrote was lost between the policy and the environment"
+            )
+        # A step of another policy, as those of random frames: L1 starts after it.
+        nested = tensordict.get(self.key)
+        return nested.apply(torch.zeros_like)
+
+    def _reset_func(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        self._ask()
+        tensordict_reset = super()._reset_func(tensordict, tensordict_reset)
+        nested = tensordict_reset.get(self.key, None)
+        if nested is not None:
+            nested.update(self._signals.expand(nested.batch_size).to(nested.device).zero())
+            self._seal(nested, tensordict_reset)
+        return tensordict_reset
+
+    def _seal(self, nested: TensorDictBase, around: TensorDictBase) -> None:
+        observation = required_entry(around, self.observation_key, "L1Controller's primer")
+        state = L1State(**{name: nested.get(name) for name in self._state_names})
+        seal = sealed(observation, state)
+        nested.set(SEAL, seal)
+        if not torch.compiler.is_compiling():
+            self._shared.emitted = Emitted.of(observation, state, seal)
+
+    def _ask(self) -> None:
+        environment = self.container
+        if self._is_checked or environment is None:
+            return
+        config = self._shared.settings.complete(environment)
+        if self.check_dt:
+            check_time_step("L1Controller", config.dt, environment)
+        if config.action_low is None or config.action_high is None:
+            self._shared.learn(*action_bounds(environment.full_action_spec[self.action_key]))
+        self._is_checked = True
 
 
 class L1Controller(TensorDictModuleBase):
@@ -46,7 +217,13 @@ class L1Controller(TensorDictModuleBase):
     Args:
         dynamics: the learned model, see :class:`~torchrl_l1.control.ActionJacobian`; an
             ``ActionJacobian`` is used as it is.
-        config: the settings. Without action bounds in it the executed input is not clipped.
+        config: the settings; or give ``dt`` and others of :class:`L1Config`'s here. Action bounds
+            that they leave open are those of ``action_spec`` or else, as soon as it is reset, of
+            the environment that a primer is appended to; infinite ones turn clipping off.
+        dt: time of one environment step in seconds; if ``None``, that of the environment with the
+            primer.
+        action_spec: of the action that leaves the controller, such as ``env.action_spec``. It may
+            be needed where policy and environment are copied into another process.
         observation_key: key of the observation.
         action_key: key of the action, replaced by the executed input.
         key: name of the nested tensordict with the controller's entries.
@@ -57,10 +234,17 @@ class L1Controller(TensorDictModuleBase):
         diagnostics: whether to write the diagnostics.
         predicts: what ``dynamics`` predicts, ``"change"`` or ``"next_observation"``; ``None``
             decides as :class:`~torchrl_l1.control.ActionJacobian` does.
+        out_key: key of the prediction of a model with several, likewise.
+        ensemble_dim: dimension of its output over which the mean is taken, likewise.
+        check_dt: whether ``dt`` must be that of an environment which tells its own.
+        check: whether each step checks that the observation and the controller's state are those
+            that the primer passed on.
+        **settings: further fields of :class:`L1Config` (``epsilon``, ``cutoff``, ...).
 
     Raises:
         KeyError: at a call, if the observation, the action or the controller's state is missing.
-        ValueError: if a width does not fit the state's. Data that are not finite raise nothing:
+        ValueError: if a setting, a width or the time step does not fit, or if the observation or
+            the state is not what the primer passed on. Data that are not finite raise nothing:
             L1 stands aside there and restarts, see :func:`~torchrl_l1.control.law.step`.
 
     Examples:
@@ -69,8 +253,7 @@ class L1Controller(TensorDictModuleBase):
         >>> from torchrl.envs import GymEnv, TransformedEnv
         >>> from torchrl_l1.dynamics import EnsembleDynamics
         >>> model = EnsembleDynamics(3, 1, hidden=(16,))
-        >>> config = L1Config(0.05, action_low=-2.0, action_high=2.0)
-        >>> l1 = L1Controller(model, config)
+        >>> l1 = L1Controller(model, dt=0.05)
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), l1.make_primer())
         >>> actor = TensorDictModule(torch.nn.Linear(3, 1), ["observation"], ["action"])
         >>> data = env.rollout(4, TensorDictSequential(actor, l1))
@@ -81,8 +264,10 @@ class L1Controller(TensorDictModuleBase):
     def __init__(
         self,
         dynamics: Dynamics,
-        config: L1Config,
+        config: L1Config | None = None,
         *,
+        dt: float | None = None,
+        action_spec: TensorSpec | None = None,
         observation_key: NestedKey = "observation",
         action_key: NestedKey = "action",
         key: str = L1_KEY,
@@ -91,26 +276,62 @@ class L1Controller(TensorDictModuleBase):
         compile: CompileMode = False,
         diagnostics: bool = True,
         predicts: Predicts | None = None,
+        out_key: NestedKey | None = None,
+        ensemble_dim: int | None = None,
+        check_dt: bool = True,
+        check: bool = True,
+        **settings: Any,
     ) -> None:
         super().__init__()
-        self.config = config
-        self.model = as_action_jacobian(dynamics, observation_key, action_key, predicts)
+        self._environment = _Environment(Settings("L1Controller", config, dt, settings))
+        self.model = as_model(
+            dynamics, observation_key, action_key, predicts, out_key, ensemble_dim
+        )
         self.observation_key = observation_key
         self.action_key = action_key
         self.key = key
         self.compile_mode = compile
         self.diagnostics = diagnostics
+        self.check_dt, self.check = check_dt, check
+        if action_spec is not None:
+            action_spec = leaf_spec(action_spec)
+            self._environment.settings.bound(*action_bounds(action_spec))
+            if action_dim is None:
+                action_dim = action_spec.shape[-1]
         self._dims = (
             declared_dimension(self.model, "observation_dim", observation_dim),
             declared_dimension(self.model, "action_dim", action_dim),
         )
-        self._state_names = state_names(config)
+        self._state_names = state_names(self._environment.settings.config)
         self.in_keys = [observation_key, action_key, *((key, name) for name in self._state_names)]
         self.out_keys = [action_key, (key, "u_rl")]
         self.out_keys += [("next", key, name) for name in (*self._state_names, "u_exec")]
-        self._step = make_step(config, self.model, compile, diagnostics)
+        self._step: StepFunction | None = None
+        self._step_config: L1Config | None = None
 
-    def make_primer(self) -> TensorDictPrimer:
+    @property
+    def config(self) -> L1Config:
+        """The settings, with action bounds and time step of the environment where it told them.
+
+        Raises:
+            ValueError: if the time step is the environment's and none has told it yet.
+        """
+        if not self._environment.settings.is_complete:
+            raise ValueError(
+                "L1Controller knows dt once an environment with its primer, which tells it, is "
+                "reset: give dt otherwise"
+            )
+        return self._environment.config
+
+    @property
+    def policy_action_key(self) -> tuple[str, str]:
+        """Key of the policy's action, to which its log-probabilities belong.
+
+        A loss on collected data reads it as ``loss.set_keys(action=controller.policy_action_key)``.
+        """
+        return self.key, "u_rl"
+
+    def make_primer(self) -> L1Primer:
         """Transform that gives the environment the controller's state, zero at every reset."""
         observation_dim, action_dim = self._dims
         if observation_dim is None or action_dim is None:
@@ -118,12 +339,11 @@ class L1Controller(TensorDictModuleBase):
                 "the primer needs the widths of observation and action, and the model does not "
                 "tell: give L1Controller observation_dim and action_dim"
             )
-        self.config.check_dimensions(observation_dim, action_dim)
+        self._environment.config.check_dimensions(observation_dim, action_dim)
         dtype = self.model.dtype or torch.get_default_dtype()
         layout = Layout(torch.Size([]), observation_dim, action_dim, dtype, dtype)
-        return TensorDictPrimer(
-            Composite({self.key: layout.state_spec(self.config)}), expand_specs=True
-        )
+        keys = self.observation_key, self.action_key, self.key
+        return L1Primer(self._environment, layout, *keys, self.diagnostics, self.check_dt)
 
     # The name under which torchrl.modules.utils.get_primers_from_module looks for it.
     make_tensordict_primer = make_primer
@@ -131,7 +351,7 @@ class L1Controller(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """One step of the controller, see the class."""
         u_rl, executed, following = advance(
-            self._step,
+            self._prepared(),
             self._state_names,
             tensordict,
             self.observation_key,
@@ -140,16 +360,30 @@ class L1Controller(TensorDictModuleBase):
             owner="L1Controller",
             remedy="append the primer to the environment, "
             "TransformedEnv(env, controller.make_primer())",
+            check=self.check,
+            emitted=self._environment.emitted,
+            seal_is_required=False,
         )
         tensordict.set((self.key, "u_rl"), u_rl)
         tensordict.set(self.action_key, executed)
         tensordict.set(("next", self.key), following)
         return tensordict
 
+    def _prepared(self) -> StepFunction:
+        config = self.config
+        if self._step is None or config != self._step_config:
+            if not self._environment.is_known and None in (config.action_low, config.action_high):
+                warnings.warn(
+                    "L1Controller has no action bounds, and what it sends is not clipped: give it "
+                    "action_spec=env.action_spec, or infinite action_low and action_high if that "
+                    "is meant",
+                    UserWarning,
+                    stacklevel=3,
+                )
+            self._step = make_step(config, self.model, self.compile_mode, self.diagnostics)
+            self._step_config = config
+        return self._step
+
     def __getstate__(self) -> dict[str, Any]:
         # Compiled functions do not travel between processes.
-        return {name: value for name, value in self.__dict__.items() if name != "_step"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
-        self._step = make_step(self.config, self.model, self.compile_mode, self.diagnostics)
+        return self.__dict__ | {"_step": None}

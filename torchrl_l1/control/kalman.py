@@ -25,13 +25,13 @@ def time_update(covariance: Tensor, process_noise: Tensor | float) -> Tensor:
 
     Args:
         covariance: ``(..., m, m)``.
-        process_noise: standard deviation of the walk's step, ``(m,)`` or a number.
+        process_noise: standard deviation of the walk's step, ``(..., m)`` or a number.
 
     Returns:
         ``(..., m, m)``.
     """
     variance = torch.as_tensor(process_noise, dtype=covariance.dtype, device=covariance.device)
-    variance = variance.square().expand(covariance.shape[-1])
+    variance = variance.square().expand(covariance.shape[:-1])
     return covariance + torch.diag_embed(variance)
 
 
@@ -75,24 +75,38 @@ def _bolstered(covariance: Tensor) -> Tensor:
     return covariance + (least * trace)[..., None, None] * eye
 
 
-def noise_ratio(covariance: Tensor, jacobian: Tensor, posterior: Posterior, left: Tensor) -> Tensor:
+def noise_ratio(
+    covariance: Tensor,
+    jacobian: Tensor,
+    posterior: Posterior,
+    left: Tensor,
+    unknown: Tensor | None = None,
+) -> Tensor:
     r"""How much larger than expected one residual's squares are, state by state: ``(..., n)``.
 
     :math:`((r - J d)_i^2 + (J P J^\top)_{ii}) / \Lambda_{ii}` with the posterior mean and
     covariance of the disturbance: the E step of expectation maximisation, in which what the
-    disturbance explains is no noise and what is not known of it counts as expected.
+    disturbance explains is no noise and what is not known of it counts as expected. The share that
+    effects of another kind explain is taken out likewise.
 
     Args:
         covariance: expected covariance of the residual :math:`\Lambda` ``(..., n, n)``.
         jacobian: ``(..., n, m)``.
         posterior: of the disturbance, this residual included.
         left: what it leaves unexplained of the residual, :math:`r - J d` ``(..., n)``.
+        unknown: a factor of the covariance of other effects ``(..., n, k)``.
 
     Returns:
         the ratios ``(..., n)``; their mean is one where the expectation is right.
     """
     unseen = ((jacobian @ posterior.covariance) * jacobian).sum(-1)
-    return (left.square() + unseen) / covariance.diagonal(dim1=-2, dim2=-1)
+    variance = covariance.diagonal(dim1=-2, dim2=-1)
+    square = left.square() + unseen
+    if unknown is None:
+        return square / variance
+    others = unknown.square().sum(-1)
+    share = variance / (variance + others)
+    return share * share * square / variance + (1 - share)
 
 
 def doubt(jacobian: Tensor, innovation: Tensor, change: Tensor) -> Tensor:

@@ -46,6 +46,40 @@ class Estimate(NamedTuple):
     finite: Tensor
 
 
+class Reach(NamedTuple):
+    """What of a disturbance comes through to a plant whose actuators end at the action's bounds.
+
+    Whether they do is not known: a bias of a motor's command is cut off by the motor's limit, a
+    load on its axis is not. What would lie beyond is expected to be cut off, as in most
+    simulators, and may be there all the same: no reason to take it for noise, and none to learn
+    from it.
+
+    Attributes:
+        passed: what of the mean stays within the bounds ``(..., m)``, action units.
+        within: entries whose whole effect is sure ``(..., m)``, bool.
+        deviation: standard deviation of what comes beside ``passed`` in the others, if anything
+            does, ``(..., m)``; zero for those within.
+    """
+
+    passed: Tensor
+    within: Tensor
+    deviation: Tensor
+
+    @classmethod
+    def of(cls, config: L1Config, executed: Tensor, posterior: Posterior) -> Reach:
+        """For an executed input ``(..., m)`` and what is known of the disturbance."""
+        mean = posterior.mean
+        passed = saturate(config, executed + mean) - executed
+        margin = 1e-3 * like(mean, config.half_range)
+        above, below = (
+            saturate(config, executed + mean + sign * margin) - executed for sign in (1, -1)
+        )
+        # Rounding may take some of twice the margin, a bound takes at least half.
+        within = above - below > 1.5 * margin
+        variance = posterior.covariance.diagonal(dim1=-2, dim2=-1) + (mean - passed).square()
+        return cls(passed, within, variance.sqrt().masked_fill(within, 0.0))
+
+
 def estimate(
     config: L1Config,
     state: L1State,
@@ -64,7 +98,9 @@ def estimate(
         x_t - x_{t-1} - \hat f(x_{t-1}, u_{t-1}) = J_{t-1} d_t + w_t, \quad
         w_t \sim N(0, D_t \Lambda D_t)
 
-    with :math:`\Lambda` the inflated covariance of the residuals. The squares of the diagonal
+    where the input and what adds to it stay within the bounds of the action; what lies beyond may
+    reach the plant or not, see :class:`Reach`. Here :math:`\Lambda` is the inflated covariance of
+    the residuals. The squares of the diagonal
     :math:`D_t` are a running mean of :func:`~.kalman.noise_ratio`, none below one, times their
     mean over the states: a state whose sensor has become noisy loses its weight, and all do where
     many have. A single residual beyond expectation loses it at once, see
@@ -96,7 +132,10 @@ def estimate(
             kalman.time_update(state.covariance.unflatten(-1, (m, m)), process_noise),
         ),
     )
-    jacobian = state.jacobian.masked_fill(fresh, 0.0).unflatten(-1, (n, m))
+    seen = state.jacobian.masked_fill(fresh, 0.0).unflatten(-1, (n, m))
+    reach = Reach.of(config, state.u_bar, prior)
+    jacobian = seen * reach.within.unsqueeze(-2)
+    unknown = seen * reach.deviation.unsqueeze(-2)
     innovation = (observation - state.x_hat).masked_fill(fresh, 0.0)
     expected = (jacobian @ prior.mean.unsqueeze(-1)).squeeze(-1)
     residual = innovation + expected
@@ -107,7 +146,10 @@ def estimate(
     # From observations that are noisier than its data were, a model errs in a lasting way too: the
     # policy reacts to the noise, and the mean of a nonlinear function is not that of its argument.
     scale = (larger * larger.mean(-1, keepdim=True)).sqrt().unsqueeze(-1)
-    columns, white = whitened(covariance, jacobian / scale, innovation.unsqueeze(-1) / scale)
+    unknown = unknown / scale
+    columns, white = whitened(
+        covariance + unknown @ unknown.mT, jacobian / scale, innovation.unsqueeze(-1) / scale
+    )
     white = white.squeeze(-1)
     posterior = kalman.measurement_update(prior, columns, white)
     if config.forgetting < 1:
@@ -115,7 +157,7 @@ def estimate(
         doubt = kalman.doubt(columns, white, posterior.mean - prior.mean).sqrt()
         posterior = kalman.measurement_update(prior, columns / doubt.unsqueeze(-1), white / doubt)
         left = residual - (jacobian @ posterior.mean.unsqueeze(-1)).squeeze(-1)
-        ratio = kalman.noise_ratio(covariance, jacobian, posterior, left)
+        ratio = kalman.noise_ratio(covariance, jacobian, posterior, left, unknown * scale)
         noise = torch.where(fresh, noise, torch.lerp(ratio, noise, config.forgetting))
 
     flat = posterior.covariance.flatten(-2)
@@ -167,7 +209,7 @@ def follow(
     q = kalman.significant(posterior, config.dead_zone)
     unbounded = u_rl - q
     u = saturate(config, unbounded)
-    step_u = (u if u_bar is None else u - wide(u_bar)) + posterior.mean
+    step_u = (u if u_bar is None else u - wide(u_bar)) + Reach.of(config, u, posterior).passed
     x_hat = observation + change + (jacobian @ step_u.unsqueeze(-1)).squeeze(-1)
 
     finite = estimated.finite & is_finite(jacobian.flatten(-2))
@@ -179,7 +221,7 @@ def follow(
     assert state.covariance is not None
     following = L1State(
         x_hat=x_hat.masked_fill(non_finite, 0.0),
-        u_bar=state.u_bar,
+        u_bar=u.masked_fill(non_finite, 0.0),
         q=q,
         sigma_m=posterior.mean,
         n_switch=state.n_switch,

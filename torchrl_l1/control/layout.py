@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl_l1.control.affine import StepFunction
 from torchrl_l1.control.config import L1Config, Scalars
 from torchrl_l1.control.jacobian import ActionJacobian, ChangeFunction, DynamicsModel, Predicts
+from torchrl_l1.control.seal import SEAL, Emitted, seal_width, verify
 from torchrl_l1.control.state import L1Diagnostics, L1State, init
 
 L1_KEY = "l1"
@@ -65,7 +66,7 @@ class Layout:
         """
         observation = _vector_spec(env, "observation", observation_key)
         action = _vector_spec(env, "action", action_key)
-        low, high = _bounds(action)
+        low, high = action_bounds(action)
         return cls(
             batch_size=env.batch_size,
             observation_dim=observation.shape[-1],
@@ -84,20 +85,24 @@ class Layout:
         return replace(config, action_low=low, action_high=high)
 
     def state_spec(self, config: L1Config) -> Composite:
-        """Spec of an :class:`~torchrl_l1.control.L1State` with these settings."""
+        """Spec of an :class:`~torchrl_l1.control.L1State` with these settings, and of its seal."""
         state = init([], self.observation_dim, self.action_dim, config, dtype=self.dtype)
-        return self._composite(
-            {name: (value.shape[-1], value.dtype) for name, value in state.entries().items()}
-        )
+        entries = {name: (value.shape[-1], value.dtype) for name, value in state.entries().items()}
+        entries[SEAL] = (seal_width(self.observation_dim), self.dtype)
+        return self._composite(entries)
 
-    def spec(self, config: L1Config, diagnostics: bool = True) -> Composite:
-        """Spec of the state, the executed input ``u_exec`` and, if wanted, the diagnostics."""
+    def signal_spec(self, diagnostics: bool = True) -> Composite:
+        """Spec of the executed input ``u_exec`` and, if wanted, the diagnostics."""
         entries = {"u_exec": (self.action_dim, self.action_dtype)}
         if diagnostics:
             for name in L1Diagnostics._fields:
                 entries[name] = (1, torch.bool if name in _FLAGS else self.dtype)
+        return self._composite(entries)
+
+    def spec(self, config: L1Config, diagnostics: bool = True) -> Composite:
+        """Spec of the state, the executed input ``u_exec`` and, if wanted, the diagnostics."""
         spec = self.state_spec(config)
-        spec.update(self._composite(entries))
+        spec.update(self.signal_spec(diagnostics))
         return spec
 
     def zero(
@@ -146,7 +151,12 @@ def _vector_spec(env: EnvBase, kind: str, key: NestedKey) -> TensorSpec:
     return spec
 
 
-def _bounds(action: TensorSpec) -> tuple[Scalars | None, Scalars | None]:
+def action_bounds(action: TensorSpec) -> tuple[Scalars | None, Scalars | None]:
+    """Bounds of an action spec, ``None`` if it has none.
+
+    Raises:
+        ValueError: if the environments of a batch have different ones.
+    """
     if not isinstance(action, Bounded):
         return None, None
     low, high = (
@@ -209,8 +219,24 @@ def advance(
     *,
     owner: str,
     remedy: str,
+    check: bool = True,
+    emitted: Emitted | None = None,
+    seal_is_required: bool = True,
 ) -> tuple[Tensor, Tensor, TensorDict]:
     """Read a step's inputs, the state's entries of those names among them, and take the step.
+
+    Args:
+        step: the controller's step.
+        names: of the state's entries.
+        tensordict: to read.
+        observation_key: key of the observation.
+        action_key: key of the action.
+        key: of the nested tensordict with the state.
+        owner: name of the class that reads, for errors.
+        remedy: what to do where there is no state.
+        check: whether observation and state must be those that were sealed.
+        emitted: what was sealed last.
+        seal_is_required: whether there must be a seal.
 
     Returns:
         the policy's action, the executed input (both in the action's type) and the nested
@@ -222,9 +248,15 @@ def advance(
     if nested is None or not isinstance(nested, TensorDictBase):
         raise KeyError(f"{owner} found no state under {key!r}: {remedy}")
     entries = {name: nested.get(name, None) for name in names}
+    seal = nested.get(SEAL, None) if check else None
     missing = [name for name, value in entries.items() if value is None]
+    if check and seal_is_required and seal is None:
+        missing.append(SEAL)
     if missing:
-        raise KeyError(f"{owner} found no {missing} under {key!r}: {remedy}")
+        lost = (
+            "a transform, a module or a collector took it away on the way; keep all that is there"
+        )
+        raise KeyError(f"{owner} found no {missing} under {key!r}: {lost}")
     state = L1State(**entries)
     for name, value, like in (
         (observation_key, observation, state.x_hat),
@@ -233,9 +265,21 @@ def advance(
         if value.shape != like.shape:
             raise ValueError(
                 f"{owner}: {name!r} has shape {tuple(value.shape)}, expected {tuple(like.shape)} "
-                f"as the state under {key!r}"
+                f"as the state under {key!r}; what changes it (a normaliser, a later transform, "
+                "the policy) must have separate out_keys, or L1 another key to read"
             )
     dtype = state.x_hat.dtype
+    if seal is not None:
+        observation = verify(
+            observation,
+            state,
+            seal,
+            owner=owner,
+            observation_key=observation_key,
+            key=key,
+            emitted=emitted,
+            zero_is_none=not seal_is_required,
+        )
     with torch.no_grad():
         executed, state, signals = step(state, observation.to(dtype), action.to(dtype))
     executed = executed.to(action.dtype)

@@ -59,7 +59,7 @@ class ResidualStatistics(NamedTuple):
 
     covariance: Tensor
     inflation: Tensor | float = 1.0
-    process_noise: Tensor | float = 0.003
+    process_noise: Tensor | float = 0.01
 
 
 class L1Diagnostics(NamedTuple):

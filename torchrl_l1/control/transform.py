@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import fields
 from typing import Any
 
 import torch
@@ -12,17 +10,24 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
-from torchrl.envs.transforms import Compose, Transform
+from torchrl.envs.transforms import Transform
 
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control.affine import StepFunction, make_step
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import Predicts
-from torchrl_l1.control.layout import L1_KEY, Dynamics, Layout, advance, as_action_jacobian
-from torchrl_l1.control.state import state_names
-
-# Where a step's outcome waits, inside the tensordict, for the base environment to return.
-_PENDING = "_l1_pending"
+from torchrl_l1.control.layout import L1_KEY, Dynamics, Layout, advance
+from torchrl_l1.control.pipeline import (
+    Settings,
+    as_model,
+    carry,
+    check_order,
+    check_time_step,
+    unspecified,
+    widen_selection,
+)
+from torchrl_l1.control.seal import SEAL, Emitted, sealed
+from torchrl_l1.control.state import L1Diagnostics, L1State, state_names
 
 
 class L1Transform(Transform):
@@ -35,10 +40,13 @@ class L1Transform(Transform):
     (:class:`~torchrl_l1.control.L1Diagnostics`). A reset starts the controller afresh in the
     environments that it resets and in no others.
 
-    Order matters. Transforms that disturb the executed input (noise, bias) must come before
-    this one in ``Compose``, as the last transform meets the action first. L1 reads the
-    observation that the policy reads: transforms that change it must come before as well, and
-    the model must have been fitted to that observation.
+    Order matters, as the last transform of ``Compose`` meets the action first. Before this one
+    come transforms that disturb the executed input (noise, bias), that repeat it
+    (``FrameSkipTransform``) or that change the observation, to which the model must have been
+    fitted; after it those that map the policy's action to what L1 works in (``ActionScaling``).
+    L1 refuses an order that is wrong, and what it cannot see in the chain it notices at the next
+    step: the observation that it reads must be the one that it passed on, and its state that of
+    the last step. A change of type or device is none.
 
     Action bounds that the configuration leaves open are taken from the action spec where it
     is bounded; infinite bounds in the configuration turn clipping off.
@@ -52,7 +60,8 @@ class L1Transform(Transform):
         dynamics: the learned model, see :class:`~torchrl_l1.control.ActionJacobian`; an
             ``ActionJacobian`` is used as it is.
         config: the settings; or give ``dt`` and others of :class:`L1Config`'s here.
-        dt: time of one environment step in seconds.
+        dt: time of one environment step in seconds; the environment's own if ``None``, see
+            :func:`~torchrl_l1.control.time_step`.
         observation_key: key of the observation.
         action_key: key of the action.
         key: name of the nested tensordict with the controller's entries.
@@ -63,11 +72,17 @@ class L1Transform(Transform):
             ``None``, or the observation's for a model without any.
         predicts: what ``dynamics`` predicts, ``"change"`` or ``"next_observation"``; ``None``
             decides as :class:`~torchrl_l1.control.ActionJacobian` does.
+        out_key: key of the prediction of a model with several, likewise.
+        ensemble_dim: dimension of its output over which the mean is taken, likewise.
+        check_dt: whether ``dt`` must be that of an environment which tells its own.
+        check: whether each step checks that the observation and the controller's state are those
+            that the last one gave; switch it off where you edit them on purpose.
         **settings: further fields of :class:`L1Config` (``epsilon``, ``cutoff``, ...).
 
     Raises:
-        ValueError: if a setting or width does not fit, at a reset to an observation that is not
-            finite, or if a later transform overwrites the observation.
+        ValueError: if a setting, a width, the time step or the order of transforms does not fit,
+            at a reset to an observation that is not finite, or at a step whose observation or
+            state is not what the last one gave.
         KeyError: at a step, if the observation, the action or the controller's state is missing.
         RuntimeError: if used in a replay buffer.
 
@@ -94,41 +109,80 @@ class L1Transform(Transform):
         diagnostics: bool = True,
         dtype: torch.dtype | None = None,
         predicts: Predicts | None = None,
+        out_key: NestedKey | None = None,
+        ensemble_dim: int | None = None,
+        check_dt: bool = True,
+        check: bool = True,
         **settings: Any,
     ) -> None:
         super().__init__()
-        self.config = _configuration(config, dt, settings)
-        self.model = as_action_jacobian(dynamics, observation_key, action_key, predicts)
+        self._settings = Settings("L1Transform", config, dt, settings)
+        self.model = as_model(
+            dynamics, observation_key, action_key, predicts, out_key, ensemble_dim
+        )
         self.observation_key = unravel_key(observation_key)
         self.action_key = unravel_key(action_key)
         self.key = key
-        self._state_names = state_names(self.config)
+        self._pending = f"_{key}_pending"
+        self._state_names = state_names(self._settings.config)
+        self.check_dt, self.check = check_dt, check
         self.compile_mode = compile
         self.diagnostics = diagnostics
         self.dtype = self.model.dtype if dtype is None else dtype
         self._layout: Layout | None = None
+        self._is_ready = self._is_stateful = False
         self._step_config: L1Config | None = None
         self._step_function: StepFunction | None = None
+        self._emitted: Emitted | None = None
+        self._consumed: Tensor | None = None
+        self._repeats = 0
+        self._lacking: list[str] | None = None
+
+    @property
+    def config(self) -> L1Config:
+        """The settings.
+
+        Raises:
+            ValueError: if the time step is the environment's and there is none yet.
+        """
+        if not self._settings.is_complete:
+            raise ValueError(
+                "L1Transform knows dt once an environment is reset that tells it: give dt otherwise"
+            )
+        return self._settings.config
 
     def set_container(self, container: Transform | EnvBase) -> None:
         """Attach to an environment, whose specs then decide widths and bounds."""
-        self._layout = None
+        self._forget()
         super().set_container(container)
+        if self._is_in_environment():
+            self._check_order()
 
     def empty_cache(self) -> None:
         """Forget what the specs decided: a transform before this one may have changed them."""
-        self._layout = None
+        self._forget()
         super().empty_cache()
+
+    def _forget(self) -> None:
+        self._layout = None
+        self._emitted = self._consumed = None
+        self._lacking = None
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the controller's state and signals."""
         self._check_order()
-        observation_spec[self.key] = self._resolve().spec(self.config, self.diagnostics)
+        if observation_spec.get(self.key, None) is not None:
+            raise ValueError(
+                f"the environment has entries under {self.key!r} already, of another controller? "
+                "Give L1Transform a key of its own"
+            )
+        layout = self._resolve()
+        observation_spec[self.key] = layout.spec(self._settings.config, self.diagnostics)
         return observation_spec
 
     def transform_state_spec(self, state_spec: TensorSpec) -> TensorSpec:
         """Add the controller's state, which a step reads."""
-        state_spec[self.key] = self._resolve().state_spec(self.config)
+        state_spec[self.key] = self._resolve().state_spec(self._settings.config)
         return state_spec
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -140,11 +194,16 @@ class L1Transform(Transform):
         )
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self._layout is None or self._step_function is None:
+        if self._layout is None or not self._is_ready:
             # After copying, or when a transform before this one came or went without a reset.
             if not self._is_in_environment():
                 return self.forward(tensordict)
-            self._resolve()
+            self._complete()
+        if tensordict.get(self._pending, None) is not None:
+            raise ValueError(
+                "L1Transform is applied again to its own output: a transform after it repeats the "
+                "step, as FrameSkipTransform does; it must come before L1Transform in Compose"
+            )
         assert self._step_function is not None
         _, executed, following = advance(
             self._step_function,
@@ -155,13 +214,36 @@ class L1Transform(Transform):
             self.key,
             owner="L1Transform",
             remedy="reset the environment first and pass on what reset or step_mdp returned",
+            check=self.check,
+            emitted=self._emitted,
         )
+        if self.check and not torch.compiler.is_compiling():
+            self._check_repeated(tensordict)
         # The caller's tensordict keeps the policy's action: this one is a shallow copy.
         tensordict.set(self.action_key, executed)
-        return tensordict.set(_PENDING, following)
+        return tensordict.set(self._pending, following)
+
+    def _check_repeated(self, tensordict: TensorDictBase) -> None:
+        """Refuse to go on where each step was taken twice, as by a FrameSkipTransform around."""
+        seal, emitted, consumed = tensordict.get((self.key, SEAL)), self._emitted, self._consumed
+        if emitted is None or not self._is_stateful:
+            return
+        if seal is emitted.seal or _equal(seal, emitted.seal):
+            if self._repeats:
+                raise ValueError(
+                    f"L1Transform stepped {self._repeats + 1} times from one state before it came "
+                    "to the next: put what repeats the action, such as FrameSkipTransform, before "
+                    "it in Compose"
+                )
+            self._consumed = seal if seal is emitted.seal else seal.clone()
+        elif consumed is not None and _equal(seal, consumed):
+            self._repeats += 1
+        else:
+            self._consumed, self._repeats = seal.clone(), 0
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        following = tensordict.get(_PENDING)
+        following = tensordict.get(self._pending)
+        self._seal(following, next_tensordict.get(self.observation_key))
         stepped = tensordict.get("_step", None)
         if stepped is not None:
             previous = tensordict.get(self.key).select(*following.keys(), strict=False)
@@ -172,13 +254,11 @@ class L1Transform(Transform):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         # Partial resets are merged by the environment, which discards the rows not reset.
-        layout = self._resolve()
-        self._check_finite(
-            tensordict_reset.get(self.observation_key), tensordict.get("_reset", None)
-        )
-        return tensordict_reset.set(
-            self.key, layout.zero(tensordict_reset.batch_size, self.config, self.diagnostics)
-        )
+        self._complete()
+        self._repeats = 0
+        observation = tensordict_reset.get(self.observation_key)
+        self._check_finite(observation, tensordict.get("_reset", None))
+        return tensordict_reset.set(self.key, self._fresh(tensordict_reset))
 
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -186,42 +266,76 @@ class L1Transform(Transform):
         # Here nothing is merged afterwards, and the mask says which rows are new.
         nested = tensordict_reset.get(self.key)
         reset = tensordict.get("_reset").reshape(nested.batch_size)
-        fresh = self._resolve().zero(nested.batch_size, self.config, self.diagnostics)
+        fresh = self._fresh(tensordict_reset)
         return tensordict_reset.set(self.key, fresh.where(reset, nested))
 
+    def _post_step_mdp_hooks(
+        self, tensordict: TensorDictBase, tensordict_: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        if self._lacking is None:
+            self._lacking = unspecified(self, self.key, (*self._state_names, SEAL))
+        carry(self._lacking, "L1Transform", self.key, tensordict, tensordict_)
+        return tensordict, tensordict_
+
+    def _check_batched_worker_compat(self) -> None:
+        lacking = unspecified(self, self.key, (*self._state_names, SEAL))
+        if lacking:
+            raise ValueError(
+                f"a batched environment would lose {lacking} of L1Transform, which a later "
+                f"transform takes from the specs: add {self.key!r} to its SelectTransform"
+            )
+
+    def _fresh(self, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        config = self._settings.config
+        fresh = self._resolve().zero(tensordict_reset.batch_size, config, self.diagnostics)
+        self._seal(fresh, tensordict_reset.get(self.observation_key))
+        return fresh
+
+    def _seal(self, nested: TensorDictBase, observation: Tensor) -> None:
+        state = L1State(**{name: nested.get(name) for name in self._state_names})
+        seal = sealed(observation, state)
+        nested.set(SEAL, seal)
+        if not torch.compiler.is_compiling():
+            self._emitted = Emitted.of(observation, state, seal)
+
     def _resolve(self) -> Layout:
-        if self._layout is None or self._step_function is None:
+        if self._layout is None:
             parent = self.parent
             if parent is None:
                 raise RuntimeError("L1Transform belongs to no environment yet")
             layout = Layout.of(parent, self.observation_key, self.action_key, self.dtype)
-            config = layout.bounded(self.config)
-            config.check_dimensions(layout.observation_dim, layout.action_dim)
-            self.model.check_dimensions(layout.observation_dim, layout.action_dim)
-            if self._step_function is None or config != self._step_config:
-                self._step_function = make_step(
-                    config, self.model, self.compile_mode, self.diagnostics
-                )
-                self._step_config = config
-            self._layout = layout
+            dimensions = layout.observation_dim, layout.action_dim
+            layout.bounded(self._settings.config).check_dimensions(*dimensions)
+            self.model.check_dimensions(*dimensions)
+            # An environment with its state in the tensordict may step from any state, also twice.
+            self._is_stateful = not list(parent.base_env.full_state_spec.keys(True, True))
+            self._layout, self._is_ready = layout, False
         return self._layout
+
+    def _complete(self) -> None:
+        """Make the step, now that the environment runs and tells what it has to tell."""
+        if self._layout is not None and self._is_ready:
+            return
+        layout, parent = self._resolve(), self.parent
+        config = self._settings.complete(parent)
+        if self.check_dt:
+            check_time_step("L1Transform", config.dt, parent)
+        config = layout.bounded(config)
+        if self._step_function is None or config != self._step_config:
+            self._step_function = make_step(config, self.model, self.compile_mode, self.diagnostics)
+            self._step_config = config
+        self._is_ready = True
+
+    def _check_order(self) -> None:
+        names = (*self._state_names, SEAL)
+        check_order(self, self.observation_key, self.action_key, self.key, names)
+        widen_selection(self, self.key, (*names, "u_exec", *L1Diagnostics._fields))
 
     def _is_in_environment(self) -> bool:
         try:
             return self.container is not None
         except ValueError:  # TorchRL's answer where the container is a replay buffer
             return False
-
-    def _check_order(self) -> None:
-        chain = list(_flatten(self.container.transform))
-        position = chain.index(self) if self in chain else len(chain)
-        for later in chain[position + 1 :]:
-            if self.observation_key in later.out_keys:
-                raise ValueError(
-                    f"{type(later).__name__} comes after L1Transform and overwrites "
-                    f"{self.observation_key!r}, which L1 reads: put it before L1Transform, or "
-                    "give it separate out_keys"
-                )
 
     def _check_finite(self, observation: Tensor, reset: Tensor | None) -> None:
         bad = ~observation.isfinite().all(-1)
@@ -235,31 +349,19 @@ class L1Transform(Transform):
             )
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}(config={self.config}, key={self.key!r})"
+        return f"{type(self).__name__}(config={self._settings.config}, key={self.key!r})"
 
     def __getstate__(self) -> dict[str, Any]:
         # Compiled functions do not travel between processes.
-        return super().__getstate__() | {"_layout": None, "_step_function": None}
+        empty = {
+            "_step_function": None,
+            "_layout": None,
+            "_emitted": None,
+            "_consumed": None,
+            "_lacking": None,
+        }
+        return super().__getstate__() | empty
 
 
-def _configuration(config: L1Config | None, dt: float | None, settings: dict[str, Any]) -> L1Config:
-    if config is not None:
-        given = [name for name, value in {"dt": dt, **settings}.items() if value is not None]
-        if given:
-            raise ValueError(f"give config or {given}, not both; see dataclasses.replace")
-        return config
-    if dt is None:
-        raise ValueError("L1Transform needs dt, the time of one environment step, or a config")
-    known = {field.name for field in fields(L1Config)}
-    unknown = sorted(set(settings) - known)
-    if unknown:
-        raise TypeError(f"L1Transform got unknown settings {unknown}; L1Config has {sorted(known)}")
-    return L1Config(dt, **settings)
-
-
-def _flatten(transform: Transform) -> Iterator[Transform]:
-    if isinstance(transform, Compose):
-        for member in transform:
-            yield from _flatten(member)
-    else:
-        yield transform
+def _equal(one: Tensor, other: Tensor) -> bool:
+    return one.shape == other.shape and torch.equal(one, other)

@@ -163,7 +163,7 @@ class EnsembleMLP(nn.Module):
         shared = x.expand(self.members, *x.shape)
         z = torch.baddbmm(self.biases[0], shared, self.weights[0])
         tangent = self.weights[0][:, None, first:last, :].expand(-1, batch, -1, -1)
-        for weight, bias in zip(self.weights[1:], self.biases[1:], strict=True):
+        for weight, bias in zip(list(self.weights)[1:], list(self.biases)[1:], strict=True):
             value, derivative = activation(z)
             stacked = torch.cat([value[:, :, None], tangent * derivative[:, :, None]], dim=2)
             stacked = torch.bmm(stacked.flatten(1, 2), weight)

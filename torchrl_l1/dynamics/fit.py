@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
+from inspect import signature
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import ReplayBuffer
 from torchrl.objectives.common import LossModule
 
 from torchrl_l1.checks import (
@@ -19,9 +21,12 @@ from torchrl_l1.checks import (
     check_positive,
     check_within,
 )
+from torchrl_l1.dynamics.factory import make_dynamics
 from torchrl_l1.dynamics.model import EnsembleDynamics
 from torchrl_l1.dynamics.network import model_precision, resolve_precision
+from torchrl_l1.dynamics.quality import entry_names, measure_quality
 from torchrl_l1.dynamics.training_step import TrainingStep
+from torchrl_l1.dynamics.transitions import Data, Transitions, read_transitions, two_parts
 
 
 @dataclass
@@ -78,6 +83,15 @@ class FitConfig:
             check_not_negative(f"fit.weight_decay[{layer}]", coefficient)
         check_optional_count("fit.elites", self.elites)
         resolve_precision(self.precision, name="fit.precision")
+
+
+FROM_SCRATCH: dict[str, Any] = {
+    "max_epochs": 200,
+    "max_gradient_steps": 3000,
+    "patience": 10,
+    "batch_size": 256,
+}
+"""Settings of a :class:`FitConfig` for a model that is fitted once, by :func:`fit_dynamics`."""
 
 
 class EnsembleDynamicsLoss(LossModule):
@@ -166,12 +180,14 @@ class FitReport:
         validation_loss: loss of the weights that were kept.
         epochs: passes over the training data.
         gradient_steps: gradient steps taken.
+        dropped: rows of the data that are no transitions of the system and were left out.
     """
 
     train_loss: float
     validation_loss: float
     epochs: int
     gradient_steps: int
+    dropped: int = 0
 
 
 @torch.no_grad()
@@ -206,39 +222,15 @@ def one_step_residuals(
     )
 
 
-def split_validation(
-    buffer: ReplayBuffer, purpose: str, items: str, setting: str
-) -> tuple[TensorDictBase, TensorDictBase]:
-    """What there is to train on, and what its flag ``validation`` ``(N,)`` keeps out of it.
-
-    Args:
-        buffer: the items.
-        purpose: what they are for, for the error.
-        items: what they are called there.
-        setting: the one that says how many are kept out.
-
-    Raises:
-        ValueError: if there is nothing to train or to validate on.
-    """
-    empty = TensorDict({"validation": torch.zeros(0, dtype=torch.bool)}, batch_size=[0])
-    data = buffer[:] if len(buffer) else empty
-    held_out = data["validation"].reshape(-1)
-    train, validation = data[~held_out], data[held_out]
-    if train.shape[0] == 0 or validation.shape[0] == 0:
-        raise ValueError(
-            f"cannot {purpose}: {train.shape[0]} training and {validation.shape[0]} validation "
-            f"{items}; collect more data or change {setting}"
-        )
-    return train, validation
-
-
 def fit_ensemble(
     dynamics: EnsembleDynamics,
-    buffer: ReplayBuffer,
+    data: Data,
     config: FitConfig,
     optimizer: torch.optim.Optimizer,
-    action_key: str = "action",
+    action_key: NestedKey = "action",
     on_epoch: Callable[[int], None] | None = None,
+    observation_key: NestedKey = "observation",
+    seed: int = 0,
 ) -> FitReport:
     """Fit all members at once, each on its own shuffle of the training data.
 
@@ -249,23 +241,127 @@ def fit_ensemble(
 
     Args:
         dynamics: the model, changed in place.
-        buffer: transitions with ``observation``, ``action_key``, ``("next", "observation")``
-            and the flag ``validation`` ``(N,)``.
+        data: transitions with ``observation_key``, ``action_key`` and
+            ``("next", observation_key)``: a replay buffer, a tensordict of any batch size or
+            several of them, see
+            :func:`~torchrl_l1.dynamics.read_transitions` for what of them is used. The flag
+            ``validation`` says what is kept out of training; without one trajectories are drawn.
         config: see :class:`FitConfig`.
         optimizer: over ``dynamics.parameters()``; its moments persist between fits.
         action_key: ``"action"`` for the nominal label, ``"executed"`` for the executed one.
         on_epoch: called with the number of the finished epoch, for progress bars.
+        observation_key: of the observation; ``("next", observation_key)`` is the one that followed.
+        seed: of the draw of trajectories kept out of training.
 
     Raises:
-        ValueError: if there is nothing to train or to validate on, or if a setting does not fit
-            the model. The model is as it was then.
+        KeyError: if the data lack a key.
+        ValueError: if there is nothing to train or to validate on, if shapes do not fit or if a
+            setting does not fit the model. The model is as it was then.
     """
     _check(config, dynamics)
-    device = next(dynamics.parameters()).device
-    train, validation = (
-        _transitions(part, action_key).to(device)
-        for part in split_validation(buffer, "fit", "transitions", "fit.validation_fraction")
+    fraction = config.validation_fraction
+    like = dynamics.change_normalizer.mean
+    keys = (observation_key, action_key)
+    transitions = read_transitions(data, *keys, fraction, seed, like.dtype, like.device)
+    return fit_to_transitions(dynamics, transitions, config, optimizer, on_epoch)
+
+
+def fit_dynamics(
+    data: Data,
+    *,
+    observation_key: NestedKey = "observation",
+    action_key: NestedKey = "action",
+    names: Sequence[str] | None = None,
+    units: Sequence[str] | None = None,
+    config: FitConfig | None = None,
+    seed: int = 0,
+    device: torch.device | str | None = None,
+    on_epoch: Callable[[int], None] | None = None,
+    **settings: Any,
+) -> EnsembleDynamics:
+    """A model of the dynamics, fitted to data of one's own, and how good it is.
+
+    Args:
+        data: transitions as TorchRL makes them: a replay buffer, a tensordict of any batch size,
+            or several of them, see :func:`~torchrl_l1.dynamics.read_transitions`.
+        observation_key: of the observation ``(..., n)``; ``("next", observation_key)`` is the one
+            that followed.
+        action_key: of what was sent to the actuators ``(..., m)``.
+        names: of the entries of the observation, for the report.
+        units: theirs.
+        config: how to fit; settings for one fit from scratch if ``None``: up to 3000 gradient
+            steps of 256 transitions.
+        seed: of weights, shuffles and the trajectories kept out of training. The global random
+            numbers stay as they are.
+        device: of the model; the CPU if ``None``.
+        on_epoch: called with the number of the finished epoch, for progress bars.
+        settings: fields of :class:`FitConfig`, such as ``validation_fraction``, and arguments of
+            :func:`~torchrl_l1.dynamics.make_dynamics`, such as ``members``, ``head`` or
+            ``hidden``, here ``(128, 128)`` unless given.
+
+    Returns:
+        the model, in evaluation mode, with its :attr:`~EnsembleDynamics.quality`, which prints as
+        a table.
+
+    Warns:
+        UserWarning: if rows of the data are left out, or if the model is too poor for L1 to be of
+            use.
+
+    Raises:
+        KeyError: if the data lack a key.
+        TypeError: for a setting that does not exist.
+        ValueError: if the data do not suffice, or for shapes or settings that make no sense.
+
+    Examples:
+        >>> x, u = torch.randn(500, 2, dtype=torch.float64), torch.randn(500, 1)
+        >>> data = TensorDict({"observation": x, "action": u}, batch_size=[500])
+        >>> data["next", "observation"] = 0.9 * x + 0.1 * u
+        >>> model = fit_dynamics(data, hidden=(32,), names=["angle", "rate"])
+        >>> model.quality.validation
+        50
+    """
+    of_fit = {field.name for field in fields(FitConfig)}
+    fitting = {name: settings.pop(name) for name in of_fit & set(settings)}
+    config = replace(config or FitConfig(**FROM_SCRATCH), **fitting)
+    known = {*signature(make_dynamics).parameters, *signature(EnsembleDynamics).parameters}
+    known -= {"observation_dim", "action_dim", "settings"}
+    if unknown := sorted(set(settings) - known):
+        raise TypeError(
+            f"fit_dynamics has no setting {unknown[0]!r}: those of the model are "
+            f"{', '.join(sorted(known))}, those of the fit {', '.join(sorted(of_fit))}"
+        )
+    fraction, here = config.validation_fraction, torch.device(device or "cpu")
+    keys = (observation_key, action_key)
+    transitions = read_transitions(data, *keys, fraction, seed, torch.get_default_dtype(), here)
+    n, m = (transitions.data[key].shape[-1] for key in ("observation", "action"))
+    entry_names(n, names, units)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        dynamics = make_dynamics(n, m, **{"hidden": (128, 128), **settings}).to(here)
+        optimizer = torch.optim.Adam(dynamics.parameters(), lr=config.learning_rate)
+        fit_to_transitions(dynamics, transitions, config, optimizer, on_epoch)
+    dynamics.quality = measure_quality(dynamics, transitions, names, units)
+    if dynamics.quality.warning:
+        warnings.warn(dynamics.quality.warning, stacklevel=2)
+    return dynamics.eval()
+
+
+def fit_to_transitions(
+    dynamics: EnsembleDynamics,
+    transitions: Transitions,
+    config: FitConfig,
+    optimizer: torch.optim.Optimizer,
+    on_epoch: Callable[[int], None] | None = None,
+) -> FitReport:
+    """As :func:`fit_ensemble`, to transitions that have been read."""
+    _check(config, dynamics)
+    device = dynamics.device
+    train, validation = two_parts(
+        transitions.data,
+        transitions.validation,
+        *("fit", "transitions", "fit.validation_fraction"),
     )
+    _check_widths(dynamics, train)
     dynamics.train()
     change = train["next", "observation"] - train["observation"]
     dynamics.fit_statistics(train["observation"], train["action"], change)
@@ -328,7 +424,17 @@ def fit_ensemble(
         validation_loss=best_loss.mean().item(),
         epochs=epoch,
         gradient_steps=steps,
+        dropped=transitions.dropped,
     )
+
+
+def _check_widths(dynamics: EnsembleDynamics, data: TensorDictBase) -> None:
+    found = data["observation"].shape[-1], data["action"].shape[-1]
+    if found != (dynamics.observation_dim, dynamics.action_dim):
+        raise ValueError(
+            f"the model takes observations of width {dynamics.observation_dim} and actions of "
+            f"width {dynamics.action_dim}, the data have {found[0]} and {found[1]}"
+        )
 
 
 def _check(config: FitConfig, dynamics: EnsembleDynamics) -> None:
@@ -358,15 +464,3 @@ def _decay(config: FitConfig, layers: int, size: int) -> list[float]:
     hidden = config.weight_penalty / size
     given = config.weight_decay or [0.0] * layers
     return [coefficient + hidden for coefficient in given[:-1]] + given[-1:]
-
-
-def _transitions(data: TensorDictBase, action_key: str) -> TensorDict:
-    """What :class:`EnsembleDynamicsLoss` reads, with the action that is the label."""
-    return TensorDict(
-        {
-            "observation": data["observation"],
-            "action": data[action_key],
-            "next": {"observation": data["next", "observation"]},
-        },
-        batch_size=[data.shape[0]],
-    )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +15,9 @@ from torchrl_l1.dynamics.ensemble import EnsembleMLP
 from torchrl_l1.dynamics.heads import DeterministicHead, Head
 from torchrl_l1.dynamics.normalizer import DataBox, Normalizer
 from torchrl_l1.dynamics.residuals import Residuals
+
+if TYPE_CHECKING:
+    from torchrl_l1.dynamics.quality import FitQuality
 
 
 class EnsembleDynamics(nn.Module):
@@ -42,6 +46,8 @@ class EnsembleDynamics(nn.Module):
             the action, which their networks then do not read: a :class:`ControlAffineDynamics`.
             Planning networks and fits go by it.
         residuals: covariance of the one-step residuals, measured at each fit.
+        quality: how good :func:`~torchrl_l1.dynamics.fit_dynamics` found the model; ``None`` for
+            others.
 
     Examples:
         >>> import torch
@@ -66,6 +72,7 @@ class EnsembleDynamics(nn.Module):
         head: Head | None = None,
     ) -> None:
         super().__init__()
+        self.quality: FitQuality | None = None
         self.observation_dim = observation_dim
         self.action_dim = action_dim
         self.head: Head = DeterministicHead() if head is None else head
@@ -305,7 +312,58 @@ class EnsembleDynamics(nn.Module):
         self, observation: Tensor, action: Tensor, source: str = "residuals"
     ) -> ResidualStatistics:
         """:meth:`residual_covariance`, as the L1 controller takes it."""
-        return ResidualStatistics(self.residual_covariance(observation, action, source))
+        return ResidualStatistics(
+            self.residual_covariance(observation, action, source),
+            self.residuals.inflation,
+            self.residuals.process_noise,
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write weights, normalisers, head, elites, residual statistics and quality to one file.
+
+        The format is that of safetensors: tensors, and settings as JSON; nothing in it is run
+        when it is read. The file is there whole or not at all.
+
+        Args:
+            path: of the file, such as ``"model.safetensors"``; what is there is replaced.
+
+        Raises:
+            TypeError: for a class of model or head of one's own.
+
+        Examples:
+            >>> from tempfile import mkdtemp
+            >>> file = f"{mkdtemp()}/model.safetensors"
+            >>> model = EnsembleDynamics(4, 1, members=3, hidden=(16,))
+            >>> model.save(file)
+            >>> x, u = torch.randn(7, 4), torch.randn(7, 1)
+            >>> torch.equal(EnsembleDynamics.load(file)(x, u), model(x, u))
+            True
+        """
+        from torchrl_l1.dynamics.storage import save_dynamics
+
+        save_dynamics(self, path)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], device: torch.device | str = "cpu") -> Self:
+        """Read a model that :meth:`save` wrote, in evaluation mode.
+
+        Args:
+            path: of the file.
+            device: where the model is to be.
+
+        Returns:
+            the model, of the class that was saved; its predictions are equal bit for bit.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if the file is damaged, or holds something else.
+        """
+        from torchrl_l1.dynamics.storage import load_dynamics
+
+        loaded = load_dynamics(path, device)
+        if not isinstance(loaded, cls):
+            raise ValueError(f"{path} holds a {type(loaded).__name__}, no {cls.__name__}")
+        return loaded
 
     def _over_elites(self, per_member: Tensor) -> Tensor:
         """Mean of ``(E, ...)`` over the elites."""

@@ -1,11 +1,18 @@
-"""What a fitted model misses: the covariance of its one-step residuals."""
+"""What a fitted model misses: the covariance of its one-step residuals, and what L1 makes of it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
+
+from torchrl_l1.control import Calibration, L1Config, calibrate
+
+SEQUENCES, STEPS = 32, 100
+"""How much of undisturbed episodes a calibration replays: so many stretches of so many steps."""
 
 
 class Residuals(nn.Module):
@@ -18,15 +25,22 @@ class Residuals(nn.Module):
         covariance: second moments of the residuals, shrunk, ``(n, n)``, state units squared; the
             identity until they are measured.
         measured: whether the covariance is of data, ``()``, bool.
+        inflation: factor on the covariance that a Kalman filter needs, ``()``; see
+            :class:`~torchrl_l1.control.ResidualStatistics`, like the next.
+        process_noise: of a disturbance, ``()``.
     """
 
     covariance: Tensor
     measured: Tensor
+    inflation: Tensor
+    process_noise: Tensor
 
     def __init__(self, dim: int) -> None:
         super().__init__()
         self.register_buffer("covariance", torch.eye(dim))
         self.register_buffer("measured", torch.tensor(False))
+        self.register_buffer("inflation", torch.tensor(1.0))
+        self.register_buffer("process_noise", torch.tensor(0.01))
 
     @torch.no_grad()
     def measure(self, residual: Tensor) -> None:
@@ -90,3 +104,65 @@ def shrunk_covariance(residual: Tensor) -> Tensor:
     correlation = torch.lerp(correlation, eye, intensity)
     correlation.diagonal().fill_(1.0)
     return (correlation * torch.outer(deviation, deviation)).to(residual.dtype)
+
+
+@torch.no_grad()
+def calibrate_filter(
+    residuals: Residuals,
+    value_and_jacobian: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
+    data: TensorDictBase,
+    config: L1Config,
+    action_key: str = "action",
+) -> Calibration | None:
+    """Find the inflation and the process noise that suit a model and what it has seen.
+
+    Args:
+        residuals: the model's, changed in place.
+        value_and_jacobian: the model's, see :class:`~torchrl_l1.control.ActionJacobian`.
+        data: transitions ``[N]`` in the order in which they were collected, without
+            disturbances that the controller is to cancel; the last of them count.
+        config: the controller's settings, with the bounds of the action.
+        action_key: of the action that the model was fitted to.
+
+    Returns:
+        what :func:`~torchrl_l1.control.calibrate` found; ``None``, and no change, where no
+        episode has 20 steps in a row.
+    """
+    rows = stretches(data)
+    if rows is None:
+        return None
+    observation, action = data["observation"][rows], data[action_key][rows]
+    change, jacobian = value_and_jacobian(observation, action)
+    residual = data["next", "observation"][rows] - observation - change
+    whole = residual.isfinite().flatten(1).all(1) & jacobian.isfinite().flatten(1).all(1)
+    if not whole.any():
+        return None
+    found = calibrate(
+        config, residual[whole], jacobian[whole], residuals.covariance, action=action[whole]
+    )
+    residuals.inflation.fill_(found.inflation)
+    residuals.process_noise.fill_(found.process_noise)
+    return found
+
+
+def stretches(data: TensorDictBase) -> Tensor | None:
+    """Rows of the last unbroken stretches of episodes ``(S, T)``; ``None`` if all are too short.
+
+    A stretch goes on where the next observation of one transition is the observation of the
+    following one.
+    """
+    following, observation = data["next", "observation"], data["observation"]
+    if data.shape[0] < 2:
+        return None
+    broken = (following[:-1] != observation[1:]).any(-1).nonzero().flatten() + 1
+    edges = torch.cat([broken.new_zeros(1), broken, broken.new_tensor([data.shape[0]])])
+    lengths = edges.diff()
+    steps = min(STEPS, int(lengths.max()))
+    if steps < STEPS // 5:
+        return None
+    firsts = [
+        torch.arange(int(first), int(first + length) - steps + 1, steps)
+        for first, length in zip(edges[:-1], lengths, strict=True)
+        if length >= steps
+    ]
+    return torch.cat(firsts)[-SEQUENCES:, None] + torch.arange(steps)

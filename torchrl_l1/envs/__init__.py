@@ -17,7 +17,7 @@ from torchrl_l1.envs.actuators import (
     WalkBias,
 )
 from torchrl_l1.envs.disturbances import RandomSigns, Uniform
-from torchrl_l1.envs.factory import make_env
+from torchrl_l1.envs.factory import disturbance_transforms, make_env
 from torchrl_l1.envs.gymnasium_env import MujocoTaskEnv
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
 from torchrl_l1.envs.perturbations import (
@@ -66,6 +66,7 @@ __all__ = [
     "TaskSimulation",
     "Uniform",
     "WalkBias",
+    "disturbance_transforms",
     "disturbed_model",
     "get_task",
     "gymnasium_id",

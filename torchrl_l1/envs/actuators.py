@@ -22,7 +22,7 @@ class _Actuator(HeldDisturbance):
     """A map of the action on its way to the base environment."""
 
     reason = "it changes what an environment executes"
-    what = "action"
+    what = disturbs = "action"
     matched: ClassVar[bool]
 
     def _disturb(self, action: Tensor, value: Tensor) -> Tensor:

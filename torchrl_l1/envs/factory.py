@@ -42,6 +42,41 @@ def _active(given: dict[str, Any]) -> list[tuple[Disturbance, Any]]:
     ]
 
 
+def disturbance_transforms(**disturbances: Any) -> list[Transform]:
+    """The transforms of disturbances, in the order in which :func:`make_env` has them.
+
+    They go on any TorchRL environment that has ``action`` and ``observation``, before whatever
+    controls it.
+
+    Args:
+        **disturbances: as of :func:`make_env`; neutral ones are left out.
+
+    Raises:
+        TypeError: for a disturbance that there is not, or that is given twice.
+        ValueError: for a change of the plant, which no transform can make, or a value that a
+            disturbance cannot have.
+
+    Examples:
+        >>> [type(transform).__name__ for transform in disturbance_transforms(gain=0.5, bias=0.3)]
+        ['ActuatorGain', 'ActuatorBias']
+    """
+    active = _active(disturbances)
+    plant = [entry.name for entry, _ in active if entry.transform is None]
+    if plant:
+        raise ValueError(f"{', '.join(plant)}: a change of the plant is no transform, see make_env")
+    actuators, sensors = _placed(active)
+    return [*actuators, *sensors]
+
+
+def _placed(active: list[tuple[Disturbance, Any]]) -> tuple[list[Transform], list[Transform]]:
+    """Transforms of actions and of observations, each such that the registry's first acts first."""
+    placed: dict[str, list[Transform]] = {"action": [], "observation": []}
+    for entry, value in active:
+        if entry.transform is not None:
+            placed[entry.acts_on].append(entry.transform(value))
+    return placed["action"][::-1], placed["observation"]
+
+
 def make_env(
     task: str | Task,
     num_envs: int = 1,
@@ -102,16 +137,12 @@ def make_env(
         torch.Size([4, 10, 1])
     """
     active = _active(disturbances)
-    placed: dict[str, list[Transform]] = {"action": [], "observation": []}
-    for entry, value in active:
-        if entry.transform is not None:
-            placed[entry.acts_on].append(entry.transform(value))
-    transforms = placed["action"][::-1]
+    transforms, sensors = _placed(active)
     if action_noise != 0:
         transforms.append(ActionNoise(action_noise))
     if observation_noise != 0:
         transforms.append(ObservationNoise(observation_noise))
-    transforms += placed["observation"]
+    transforms += sensors
     base = BatchedMujocoEnv(
         task,
         num_envs,

@@ -78,6 +78,8 @@ class ActionNoise(_UniformNoise):
         torch.Size([2, 3, 1])
     """
 
+    disturbs = "action"
+
     def __init__(self, half_width: float, action_key: NestedKey = "action") -> None:
         super().__init__(half_width, action_key)
 
@@ -99,6 +101,8 @@ class ObservationNoise(_UniformNoise):
     Raises:
         ValueError: if ``half_width`` is negative or not finite.
     """
+
+    disturbs = "observation"
 
     def __init__(self, half_width: float, observation_key: NestedKey = "observation") -> None:
         super().__init__(half_width, observation_key)

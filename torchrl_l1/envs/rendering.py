@@ -74,8 +74,13 @@ def rollout_frames(
         ValueError: if ``qpos`` has the wrong shape.
         RenderingUnavailable: if no backend works; the message says what each of them reported.
     """
-    task = get_task(task)
-    model = _decorated(task)
+    return draw_poses(_decorated(get_task(task)), qpos, size=size)
+
+
+def draw_poses(
+    model: mujoco.MjModel, qpos: np.ndarray, *, size: tuple[int, int] = (240, 180)
+) -> list[np.ndarray]:
+    """As :func:`rollout_frames`, of any MuJoCo model."""
     if np.ndim(qpos) != 2 or np.shape(qpos)[1] != model.nq:
         raise ValueError(f"qpos has shape {np.shape(qpos)}, expected (T, {model.nq})")
     reports = []

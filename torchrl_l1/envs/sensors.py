@@ -18,7 +18,7 @@ class _Sensor(HeldDisturbance):
     """A map of the observation, those of resets included."""
 
     reason = "it must enter the data once, while they are collected"
-    what = "observation"
+    what = disturbs = "observation"
     matched = False
 
     def _first(self, reading: Tensor) -> Tensor:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import re
+
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 
 class RecipeError(Exception):
-    """No such recipe; the message lists those that exist."""
+    """A recipe does not exist or cannot be used; the message says why and what to do."""
 
 
 class RunDirectoryError(Exception):
@@ -19,16 +22,66 @@ class RunDirectoryInUse(RunDirectoryError):
 
 
 USER_ERRORS = (
-    FileNotFoundError,
     HydraException,
     KeyError,
+    OSError,
     OmegaConfBaseException,
     RecipeError,
     RunDirectoryError,
     ValueError,
 )
 
+_SPACE = "free some space; nothing is lost, and the same command goes on"
+_REMEDIES = {
+    errno.ENOSPC: _SPACE,
+    errno.EDQUOT: _SPACE,
+    errno.EROFS: "choose a place that can be written to",
+    errno.EACCES: "change its permissions, or choose another place",
+    errno.EPERM: "change its permissions, or choose another place",
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.EISDIR: "a folder is in the way of a file; move it away",
+    errno.ENOTDIR: "a file is in the way of a folder; move it away",
+    errno.EEXIST: "something is in the way; move it away",
+    errno.ENOTEMPTY: "something is in the way; move it away",
+    errno.ELOOP: "a symbolic link is in the way; remove it",
+    errno.EMFILE: "too many files are open; raise the limit (ulimit -n)",
+    errno.EIO: "the disk fails; choose another place",
+}
+_LONGEST = 2000
+
 
 def message(error: BaseException) -> str:
-    """The error's own words; ``KeyError`` would quote them like a key."""
-    return str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+    """The error's own words in one line, with the remedy where the system has refused something."""
+    if isinstance(error, BrokenPipeError):
+        return "what reads the output has ended"
+    if isinstance(error, OSError) and error.errno is not None:
+        remedy = _REMEDIES.get(error.errno)
+        where = f"{error.filename}: " if error.filename else ""
+        return where + (error.strerror or str(error)) + (f"; {remedy}" if remedy else "")
+    # ``KeyError`` would quote its words like a key.
+    text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+    cause = error.__cause__
+    if isinstance(error, HydraException):
+        text = _of_hydra(text, str(cause) if isinstance(cause, OmegaConfBaseException) else "")
+    elif isinstance(error, OmegaConfBaseException):
+        text = _of_hydra(text, "")
+    line = " ".join(text.split())
+    return line if len(line) <= _LONGEST else line[:_LONGEST] + " ..."
+
+
+def _of_hydra(text: str, cause: str) -> str:
+    """Hydra's words without its advice to add keys that no schema knows, and without its path."""
+    unknown = re.search(r"Key '(\w+)' (?:is )?not in (?:struct|'\w+')", f"{text}\n{cause}")
+    place = re.search(r"full_key: (\S+)", f"{text}\n{cause}")
+    if unknown:
+        return f"there is no key {(place or unknown)[1]!r}; --cfg job shows those that there are"
+    text = re.split(r"\n\s*Config search path:", text)[0]
+    cause = re.split(r"\n\s*full_key:", cause)[0]
+    lines = [line.strip() for line in text.splitlines()]
+    kept = [
+        line
+        for line in lines
+        if line and not line.startswith(("To append", "full_key: ", "object_type="))
+    ]
+    where = f"{place[1]}: " if place and place[1] not in " ".join([*kept, cause]) else ""
+    return where + " ".join([*kept, cause])

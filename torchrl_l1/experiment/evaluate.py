@@ -21,9 +21,12 @@ from torchrl_l1.algorithms.collection import (
     signal_metrics,
 )
 from torchrl_l1.algorithms.policy import kinds_of
+from torchrl_l1.control import L1Config
+from torchrl_l1.dynamics import calibrate_filter
 from torchrl_l1.dynamics.fit import one_step_residuals
 from torchrl_l1.envs import DISTURBANCES, Perturbation
-from torchrl_l1.experiment.errors import RunDirectoryError
+from torchrl_l1.experiment.checkpoints import load_state
+from torchrl_l1.experiment.errors import RunDirectoryError, message
 from torchrl_l1.experiment.l1_options import (
     closest_option,
     l1_option,
@@ -60,42 +63,62 @@ class TrainedRun:
         return name
 
 
-def load_run(path: str | Path) -> TrainedRun:
+def load_run(path: str | Path, *, last: bool = False) -> TrainedRun:
     """Load recipe, model and policy of a run directory.
 
+    Args:
+        path: the directory.
+        last: whether the checkpoint before the last one will not do where that cannot be read.
+
     Raises:
-        RunDirectoryError: if the directory holds no run, or no checkpoint yet.
+        RunDirectoryError: if the directory holds no run, or no checkpoint that can be read.
     """
     directory = RunDirectory(path)
     if not directory.config_file.exists():
         raise RunDirectoryError(f"{path} holds no run: there is no {directory.config_file.name}")
     checkpoint = directory.load_checkpoint()
+    if checkpoint is not None and last and not directory.last_is_good:
+        raise RunDirectoryError(
+            f"{directory.checkpoint_file} cannot be read; resume the run, which makes it again"
+        )
     if checkpoint is None:
         raise RunDirectoryError(f"the run in {path} has no checkpoint yet; let it finish first")
-    stored = read_config(directory.config_file)
-    schema = OmegaConf.structured(schema_of(stored))
-    recipe = OmegaConf.to_object(OmegaConf.merge(schema, stored))
-    assert isinstance(recipe, RunSettings)
+    recipe = _recipe(directory)
     here: dict[str, Any] = {"device": "cpu"}
     if hasattr(recipe, "compile_plans"):
         here["compile_plans"] = False  # as "auto" decides on the CPU
     algorithm = replace(recipe, **here).build()
-    algorithm.load_state_dict({**checkpoint["algorithm"], "buffer": {}})
-    _measure_residuals(algorithm, checkpoint["algorithm"]["buffer"], recipe)
+    state = checkpoint["algorithm"]
+    load_state(algorithm, {**state, "buffer": {}}, directory.checkpoint_file)
+    _measure_residuals(algorithm, state.get("buffer", {}), recipe)
     return TrainedRun(directory.path, recipe, algorithm)
 
 
+def _recipe(directory: RunDirectory) -> RunSettings:
+    stored = read_config(directory.config_file)
+    try:
+        schema = OmegaConf.structured(schema_of(stored))
+        recipe = OmegaConf.to_object(OmegaConf.merge(schema, stored))
+        assert isinstance(recipe, RunSettings)
+        return recipe
+    # Whatever stands in a damaged file: OmegaConf and dataclasses have no common error.
+    except Exception as error:
+        raise RunDirectoryError(f"cannot use {directory.config_file}: {message(error)}") from error
+
+
 def _measure_residuals(algorithm: Algorithm, buffer: dict[str, Any], recipe: RunSettings) -> None:
-    """Residuals of models that were fitted before fits measured them, from the run's own data."""
-    dynamics = algorithm.acting_dynamics
-    if bool(dynamics.residuals.measured) or not buffer:
+    """From the run's own data, what training without a Kalman filter has not measured."""
+    dynamics, task = algorithm.acting_dynamics, algorithm.task
+    if not buffer:
         return
     data = TensorDict(buffer).auto_batch_size_(1)
+    action_key = "action" if getattr(recipe, "label", "nominal") == "nominal" else "executed"
     held_out = data[data["validation"].reshape(-1)]
-    if held_out.shape[0]:
-        label = getattr(recipe, "label", "nominal")
-        action = held_out["action" if label == "nominal" else "executed"]
-        dynamics.residuals.measure(one_step_residuals(dynamics, held_out.set("action", action)))
+    if not bool(dynamics.residuals.measured) and held_out.shape[0]:
+        held_out = held_out.set("action", held_out[action_key])
+        dynamics.residuals.measure(one_step_residuals(dynamics, held_out))
+    config = L1Config.robust(task.dt, action_low=task.action_low, action_high=task.action_high)
+    calibrate_filter(dynamics.residuals, dynamics.value_and_jacobian, data, config, action_key)
 
 
 def distinct(trained: TrainedRun, cells: Sequence[Condition]) -> list[Condition]:

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import os
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, suppress
 from pathlib import Path
+from typing import IO, Any, cast
 
 import hydra
 import yaml  # type: ignore[import-untyped]
-from hydra.errors import CompactHydraException
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import CompactHydraException, HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_l1.experiment.errors import USER_ERRORS, message
+from torchrl_l1.experiment.errors import USER_ERRORS, RecipeError, message
+from torchrl_l1.experiment.files import problem, yaml_text
 from torchrl_l1.experiment.recipes import (
     available_recipes,
     find_recipe,
@@ -19,7 +28,7 @@ from torchrl_l1.experiment.recipes import (
     shared_dir,
 )
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.settings import SCHEMAS, register
+from torchrl_l1.experiment.settings import SCHEMAS, check_known, flatten, register
 
 # The run directory is ours to open, so Hydra must not create or write to it first.
 _HYDRA_SETTINGS = [
@@ -38,26 +47,150 @@ _FLAGS_WITH_VALUE = (
 )
 
 
+# With these the configuration is put together in ways of the user's own.
+_OWN_WAYS = (
+    *("--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp", "--help", "-h"),
+    *("--experimental-rerun", "--hydra-help", "--shell-completion", "-sc"),
+)
+
+# What Hydra writes of itself: of which recipe it is, and what was overridden.
+_HYDRAS_OWN = ("job.config_name", "job.name", "job.override_dirname", "overrides", "runtime")
+
 _SCHEMA_NAMES = {f"{name}_recipe": name for name in SCHEMAS}
 
 
 def launch(name: str, arguments: Sequence[str]) -> None:
     """Run a recipe as a Hydra application with overrides and Hydra's own flags, in any order.
 
+    The flag ``--trust`` lets a recipe of the user's set up Hydra itself, see :func:`check_data`.
+
     Raises:
-        RecipeError: if there is no such recipe.
+        RecipeError: if there is no such recipe, it does not compose, or nothing would run.
     """
     recipe = find_recipe(name)
     register()
-    flags, overrides = split_flags(arguments)
+    flags, overrides = split_flags([text for text in arguments if text != "--trust"])
+    if not any(flag.partition("=")[0] in _OWN_WAYS for flag in flags):
+        _check(recipe, overrides, "-m" in flags or "--multirun" in flags, "--trust" in arguments)
     before = sys.argv
     sys.argv = ["torchrl-l1", *flags, *_search_path(recipe), *_HYDRA_SETTINGS, *overrides]
     try:
-        hydra.main(version_base="1.3", config_path=str(recipe.parent), config_name=recipe.stem)(
-            _task
-        )()
+        with redirect_stderr(cast(IO[str], _WithoutOverrides())):
+            hydra.main(version_base="1.3", config_path=str(recipe.parent), config_name=recipe.stem)(
+                _task
+            )()
     finally:
         sys.argv = before
+
+
+class _WithoutOverrides:
+    """Standard error without what Hydra adds to the line of an error: all overrides, and advice."""
+
+    _LEFT_OUT = ("Error executing job with overrides", "\nSet the environment variable HYDRA_FULL")
+
+    def __init__(self) -> None:
+        self._stream = sys.stderr
+
+    def write(self, text: str) -> int:
+        return len(text) if text.startswith(self._LEFT_OUT) else self._stream.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _check(recipe: Path, overrides: Sequence[str], sweeps: bool, trusted: bool) -> None:
+    """Compose the first run and refuse what Hydra would tell at length, or not at all."""
+    if not trusted:
+        check_data(recipe)
+    settings = [*_search_path(recipe), *_HYDRA_SETTINGS]
+    try:
+        with _composing(recipe.parent):
+            first = _first(overrides) if sweeps else list(overrides)
+            config = _composed(recipe.stem, [*settings, *first])
+        if not trusted and not recipe.is_relative_to(recipes_dir()):
+            of_hydra = [
+                text for text in first if text.lstrip("+~").startswith(("hydra.", "hydra/"))
+            ]
+            with _composing(recipes_dir()):
+                bare = _composed(None, [*settings, *of_hydra])
+            _check_hydra(recipe, config, bare)
+    except HydraException as error:
+        with suppress(HydraException), _composing(recipe.parent):
+            # Without a schema no override has a place: that is what is wrong then.
+            check_known(_composed(recipe.stem, settings))
+        raise RecipeError(message(error)) from error
+    except (yaml.YAMLError, RecursionError) as error:
+        raise RecipeError(f"{recipe}, or what it includes: {problem(error)}") from error
+    check_known(config)
+
+
+@contextmanager
+def _composing(folder: Path) -> Iterator[None]:
+    with hydra.initialize_config_dir(str(folder), version_base="1.3"):
+        yield
+
+
+def _composed(name: str | None, overrides: list[str]) -> DictConfig:
+    application = GlobalHydra.instance().hydra
+    assert application is not None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Hydra says it again when it runs
+        return application.compose_config(name, overrides, run_mode=RunMode.RUN, from_shell=False)
+
+
+def _first(overrides: Sequence[str]) -> list[str]:
+    """The overrides of the first run of a sweep."""
+    parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
+    found = []
+    for text, override in zip(overrides, parser.parse_overrides(list(overrides)), strict=True):
+        if override.is_sweep_override():
+            values = list(override.sweep_string_iterator())
+            if not values:
+                raise RecipeError(f"{text} matches nothing, so there is nothing to run")
+            text = f"{override.get_key_element()}={values[0]}"
+        found.append(text)
+    return found
+
+
+def check_data(recipe: Path) -> None:
+    """Make sure that a recipe is data: it may not set up Hydra, which would run code for it.
+
+    Args:
+        recipe: a YAML file.
+
+    Raises:
+        RecipeError: if it is no YAML, or has a section ``hydra``.
+    """
+    try:
+        content = yaml.load(yaml_text(recipe), yaml.BaseLoader)
+    except (yaml.YAMLError, RecursionError) as error:
+        raise RecipeError(f"{recipe} is not valid YAML: {problem(error)}") from error
+    except (OSError, ValueError, TypeError) as error:
+        raise RecipeError(f"{recipe} cannot be read: {message(error)}") from error
+    if not isinstance(content, dict):
+        raise RecipeError(f"{recipe} holds no keys and values")
+    defaults = content.get("defaults")
+    named = [str(one) for one in defaults] if isinstance(defaults, list) else []
+    if any(str(key).startswith("hydra") for key in content) or any(
+        "hydra/" in text or "@hydra" in text for text in named
+    ):
+        raise _no_data(recipe, "has a section hydra")
+
+
+def _check_hydra(recipe: Path, config: DictConfig, bare: DictConfig) -> None:
+    """Compare Hydra's own settings with those that there are without the recipe."""
+    own, other = (flatten(OmegaConf.to_container(part.hydra)) for part in (config, bare))
+    for key in sorted(own.keys() | other.keys()):
+        known = any(key == name or key.startswith(f"{name}.") for name in _HYDRAS_OWN)
+        if not known and own.get(key) != other.get(key):
+            raise _no_data(recipe, f"includes something that sets hydra.{key}")
+
+
+def _no_data(recipe: Path, what: str) -> RecipeError:
+    return RecipeError(
+        f"{recipe} {what}, by which any code may be run; leave that out, or say --trust if the "
+        "file is yours"
+    )
 
 
 def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -78,8 +211,11 @@ def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     return flags, overrides
 
 
-def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:
+def compose(name: str, overrides: Sequence[str] = (), *, trusted: bool = False) -> DictConfig:
     """The configuration of a recipe, without running it; ``run_dir`` must be overridden to run.
+
+    Raises:
+        RecipeError: if there is no such recipe, or it is no data and not ``trusted``.
 
     Examples:
         >>> compose("metrpo/half_cheetah", ["seed=3", "l1=off"]).l1.enabled
@@ -87,7 +223,9 @@ def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:
     """
     recipe = find_recipe(name)
     register()
-    with hydra.initialize_config_dir(str(recipe.parent), version_base="1.3"):
+    if not trusted:
+        check_data(recipe)
+    with _composing(recipe.parent):
         return hydra.compose(recipe.stem, [*_search_path(recipe), *overrides])
 
 
@@ -126,5 +264,11 @@ def _task(config: DictConfig) -> None:
     try:
         run(config)
     except USER_ERRORS as error:
-        # Hydra prints such an exception as one line and exits with status 1.
-        raise CompactHydraException(f"torchrl-l1 run: {message(error)}") from error
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        line = f"torchrl-l1 run: {message(error)}"
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            # The others go on; Hydra prints the line in the end and exits with status 1.
+            raise CompactHydraException(line) from error
+        print(line, file=sys.stderr)
+        sys.exit(1)

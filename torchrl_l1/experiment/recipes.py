@@ -43,7 +43,7 @@ def group_setting(group: str, name: str) -> dict[str, Any]:
         ValueError: if the option does not exist; the message lists those that do.
     """
     file = shared_dir() / group / f"{name}.yaml"
-    if not file.exists():
+    if name not in group_options(group):
         options = ", ".join(group_options(group))
         raise ValueError(f"unknown {group} setting {name!r}; there are {options}")
     values = OmegaConf.to_container(OmegaConf.load(file))
@@ -89,7 +89,11 @@ def _find(kind: str, name: str, available: list[str], folder: Path) -> Path:
     if own.suffix == ".yaml":
         if not own.is_file():
             raise RecipeError(f"{kind} file {name} does not exist")
+        if not own.stem.strip("."):
+            raise RecipeError(f"{kind} file {name} has no name but its dots; rename it")
         return own.resolve()
+    if own.suffix == ".yml":
+        raise RecipeError(f"{kind} file {name}: its name must end in .yaml, not .yml; rename it")
     if name not in available:
         close = get_close_matches(name, available, n=1)
         hint = f" Did you mean {close[0]}?" if close else ""

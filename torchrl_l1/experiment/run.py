@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import sys
 from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
@@ -16,8 +17,13 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_l1.algorithms import Algorithm
-from torchrl_l1.experiment.run_directory import RunDirectory, save_atomically, versions, write_table
-from torchrl_l1.experiment.settings import RunSettings
+from torchrl_l1.algorithms.algorithm import Diverged, IterationResult
+from torchrl_l1.experiment.checkpoints import checkpoint_of, load_state
+from torchrl_l1.experiment.errors import RunDirectoryError
+from torchrl_l1.experiment.files import refuse_link, write_atomically
+from torchrl_l1.experiment.run_directory import RunDirectory, versions
+from torchrl_l1.experiment.settings import RunSettings, check_known
+from torchrl_l1.experiment.signals import RESUME_ME, asked_to_make_room
 
 MODES = ("auto", "online", "offline", "disabled")
 
@@ -92,6 +98,7 @@ def run(config: DictConfig) -> Path:
         RunDirectoryError: if the run directory holds another run.
         ValueError: if settings contradict each other; nothing has been written then.
     """
+    check_known(config)
     resolved = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(resolved, dict)
     recipe = OmegaConf.to_object(config)
@@ -110,6 +117,7 @@ def run(config: DictConfig) -> Path:
         algorithm = recipe.build()
         algorithm.on_phase = lambda phase: progress.set_postfix_str(phase)
         directory = RunDirectory(recipe.run_dir)
+        refuse_link(directory.path / "wandb")
         with directory.open(settings, recipe.resume):
             _run(algorithm, recipe, settings, directory, progress)
     print(f"Finished: {directory.metrics_file}")
@@ -125,14 +133,17 @@ def _run(
 ) -> None:
     rows: list[dict[str, Any]] = []
     timings: list[dict[str, Any]] = []
-    checkpoint = directory.load_checkpoint()
+    checkpoint = directory.load_checkpoint(settings, progress.write)
     if checkpoint is not None:
-        algorithm.load_state_dict(checkpoint["algorithm"])
+        load_state(algorithm, checkpoint["algorithm"], directory.checkpoint_file)
         rows, timings = checkpoint["metrics"], checkpoint["timings"]
         progress.update(len(rows))
-        if directory.iterations_done() < len(rows):
-            # A kill has come between the checkpoint and the files made from it.
-            _write_results(algorithm, directory, rows, timings)
+        if directory.last_is_good:
+            # A kill has come between the checkpoint and the files made from it, or they changed.
+            restored = directory.restore_results(algorithm.weights(), rows, timings)
+            if restored:
+                names = ", ".join(restored)
+                progress.write(f"{directory.path}: written again from the checkpoint: {names}")
         if len(rows) >= recipe.outer_iterations:
             progress.write(f"{directory.path} is complete: nothing to do")
             return
@@ -150,30 +161,44 @@ def _run(
         if rows:
             # A kill may have come between the last checkpoint and its log entry.
             tracker.log(rows[-1], timings[-1])
-        for result in algorithm.iterate():
-            rows.append(result.metrics)
-            timings.append({"iteration": result.metrics["iteration"], **result.seconds})
-            directory.save_checkpoint(
-                {"algorithm": algorithm.state_dict(), "metrics": rows, "timings": timings}
-            )
-            _write_results(algorithm, directory, rows, timings)
-            tracker.log(rows[-1], timings[-1])
-            progress.update()
-            progress.write(
-                f"iteration {len(rows) - 1}: {result.metrics['real_steps']} real steps, "
-                f"return {result.metrics['return_mean']:.2f} "
-                f"(deterministic {result.metrics['return_deterministic']:.2f})"
-            )
+        try:
+            for result in algorithm.iterate():
+                _save(result, algorithm, settings, directory, rows, timings)
+                tracker.log(rows[-1], timings[-1])
+                progress.update()
+                progress.write(
+                    f"iteration {len(rows) - 1}: {result.metrics['real_steps']} real steps, "
+                    f"return {result.metrics['return_mean']:.2f} "
+                    f"(deterministic {result.metrics['return_deterministic']:.2f})"
+                )
+                for error in result.diverged:
+                    progress.write(f"on_divergence=warn: {error}")
+                if asked_to_make_room() and len(rows) < recipe.outer_iterations:
+                    progress.write(f"{directory.path}: saved; go on with --resume")
+                    sys.exit(RESUME_ME)
+        except Diverged as error:
+            directory.mark_diverged(str(error), rows)
+            raise RunDirectoryError(
+                f"{directory.path}: {error}; the checkpoint of {len(rows)} iterations stays, and "
+                "on_divergence=warn goes on all the same"
+            ) from error
 
 
-def _write_results(
+def _save(
+    result: IterationResult,
     algorithm: Algorithm,
+    settings: dict[str, Any],
     directory: RunDirectory,
     rows: list[dict[str, Any]],
     timings: list[dict[str, Any]],
 ) -> None:
-    for name, state in algorithm.weights().items():
-        save_atomically(directory.path / f"{name}.pt", state)
-    write_table(directory.timing_file, timings)
-    # Last: whoever finds the last row takes the run for finished and never comes back to it.
-    write_table(directory.metrics_file, rows)
+    """Write what an outer iteration has led to."""
+    marks = {"diverged": len(result.diverged)} if result.diverged else {}
+    rows.append({**result.metrics, **marks})
+    timings.append({"iteration": result.metrics["iteration"], **result.seconds})
+    directory.save_checkpoint(checkpoint_of(algorithm.state_dict(), rows, timings, settings))
+    directory.write_results(algorithm.weights(), rows, timings)
+    if result.diverged:
+        write_atomically(directory.diverged_file, f"{result.diverged[0]}\n")
+    elif not any("diverged" in row for row in rows):
+        directory.diverged_file.unlink(missing_ok=True)

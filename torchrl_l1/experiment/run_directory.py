@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 import platform
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -16,11 +15,21 @@ from typing import Any
 
 import torch
 import yaml  # type: ignore[import-untyped]
-from filelock import lock_descriptor, unlock_descriptor
 from omegaconf import OmegaConf
 
 import torchrl_l1
-from torchrl_l1.experiment.errors import RunDirectoryError, RunDirectoryInUse
+from torchrl_l1.experiment.checkpoints import read_checkpoint
+from torchrl_l1.experiment.errors import RunDirectoryError, RunDirectoryInUse, message
+from torchrl_l1.experiment.files import (
+    digest,
+    locked,
+    problem,
+    read_text,
+    saved,
+    table_text,
+    write_atomically,
+    yaml_text,
+)
 from torchrl_l1.experiment.settings import VOLATILE_KEYS, flatten, schema_defaults
 
 PACKAGES = ("torch", "tensordict", "torchrl", "gymnasium", "mujoco", "numpy")
@@ -82,37 +91,19 @@ _BEFORE_CONFIG = (".lock", "versions.json", "versions.json.tmp", "config.yaml.tm
 _MAY_GROW = "outer_iterations"
 
 
-@contextmanager
-def locked(file: Path, mode: str = "a") -> Iterator[bool]:
-    """Lock a file for as long as the block lasts, or say that another process has.
-
-    The lock is this process's, not its children's, and the system frees it when the process ends,
-    however it does.
-
-    Args:
-        file: the file; what is in it does not matter.
-        mode: how it is opened; by default it is made where there is none.
-
-    Yields:
-        whether the lock is ours.
-    """
-    with file.open(mode, encoding="utf-8") as handle:
-        ours = lock_descriptor(handle.fileno(), blocking=False)
-        try:
-            yield ours
-        finally:
-            if ours:
-                unlock_descriptor(handle.fileno())
+# Files whose checksums are kept; the tables' by their number of rows.
+_TABLES, _WEIGHTS = ("metrics.csv", "timing.csv"), ("model.pt", "policy.pt")
 
 
 class RunDirectory:
     """Files of one run.
 
     ``config.yaml`` (resolved), ``versions.json``, ``metrics.csv`` (one row per outer iteration,
-    the source of truth), ``timing.csv`` (wall-clock seconds by phase), ``checkpoint.pt``,
-    ``model.pt``, ``policy.pt``, and W&B's own files. All are replaced atomically, the checkpoint
-    first and the metrics last, so that a row of the metrics says that its iteration is complete.
-    Where a row is missing, all are made again from the checkpoint when the run resumes.
+    the source of truth), ``timing.csv`` (wall-clock seconds by phase), ``checkpoint.pt`` and the
+    one before it, ``model.pt``, ``policy.pt``, ``checksums.json`` of these, and W&B's own files.
+    All are replaced atomically, the checkpoint first and the metrics last, so that a row of the
+    metrics says that its iteration is complete. Where one is not what the checkpoint says, it is
+    made again when the run resumes.
 
     Args:
         path: the directory.
@@ -122,8 +113,13 @@ class RunDirectory:
         self.path = Path(path)
         self.config_file = self.path / "config.yaml"
         self.checkpoint_file = self.path / "checkpoint.pt"
+        self.previous_file = self.path / "checkpoint_previous.pt"
         self.metrics_file = self.path / "metrics.csv"
         self.timing_file = self.path / "timing.csv"
+        self.checksums_file = self.path / "checksums.json"
+        self.diverged_file = self.path / "diverged.txt"
+        # Whether the last checkpoint may take the place of the one before it.
+        self.last_is_good = True
 
     @contextmanager
     def open(self, config: dict[str, Any], resume: bool) -> Iterator[None]:
@@ -156,11 +152,7 @@ class RunDirectory:
             yield
 
     def _stored(self) -> dict[str, Any]:
-        if not self.config_file.exists():
-            return {}
-        stored = OmegaConf.to_container(OmegaConf.load(self.config_file))
-        assert isinstance(stored, dict)
-        return {str(key): value for key, value in stored.items()}
+        return read_config(self.config_file) if self.config_file.exists() else {}
 
     def free(self) -> bool:
         """Whether a run may begin here: there is nothing but what one killed at once has left."""
@@ -187,33 +179,218 @@ class RunDirectory:
         different = differences(self._stored(), config, may_grow=True)
         if different:
             raise RunDirectoryError(
-                f"{self.path} holds a run of another configuration:\n  "
-                + "\n  ".join(different)
-                + "\nGive the same settings, or another run_dir."
+                f"{self.path} holds a run of another configuration: {_shortened(different)}; give "
+                "the same settings, or another run_dir"
             )
 
     def iterations_done(self) -> int:
-        """Outer iterations that are complete: the rows of the metrics."""
+        """Outer iterations that are complete: the rows of the metrics.
+
+        None of a table that is not as it was written: it is made again when the run resumes.
+        """
         if not self.checkpoint_file.exists():
             return 0
         try:
-            text = self.metrics_file.read_text(encoding="utf-8")
-        except FileNotFoundError:
+            text = read_text(self.metrics_file)
+        except (OSError, ValueError):
             return 0
-        return max(len(text.splitlines()) - 1, 0)
+        rows = max(len(text.splitlines()) - 1, 0)
+        return 0 if rows and self._table_problem(self.metrics_file, text) else rows
+
+    def metrics_problem(self) -> str | None:
+        """What is wrong with the metrics; ``None`` where nothing is, or it cannot be told."""
+        try:
+            return self._table_problem(self.metrics_file, read_text(self.metrics_file))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError) as error:
+            return f"cannot read {self.metrics_file}: {error}"
+
+    def intact(self) -> bool:
+        """Whether tables and weights are as they were written, as far as that is known."""
+        known = self._checksums()
+        try:
+            for file in (self.metrics_file, self.timing_file):
+                if self._table_problem(file, read_text(file)):
+                    return False
+            for name in _WEIGHTS:
+                if name in known and digest((self.path / name).read_bytes()) != known[name]:
+                    return False
+            size = known.get(self.checkpoint_file.name)
+            return size is None or self.checkpoint_file.stat().st_size == size
+        except (OSError, ValueError):
+            return False
+
+    def _checksums(self) -> dict[str, Any]:
+        """Empty for a run that is older than they are."""
+        try:
+            known = json.loads(read_text(self.checksums_file))
+        except (FileNotFoundError, NotADirectoryError):
+            return {}
+        except (OSError, ValueError, RecursionError):
+            known = None
+        # What cannot be read fits nothing.
+        return known if isinstance(known, dict) else dict.fromkeys((*_TABLES, *_WEIGHTS), "?")
+
+    def _table_problem(self, file: Path, text: str) -> str | None:
+        known = self._checksums().get(file.name)
+        if known is None:
+            return None
+        rows = str(max(len(text.splitlines()) - 1, 0))
+        if isinstance(known, dict) and known.get(rows) == digest(text):
+            return None
+        return (
+            f"{file} is not as it was written (see {self.checksums_file.name}); --resume writes it "
+            "again from the checkpoint"
+        )
 
     def save_checkpoint(self, state: dict[str, Any]) -> None:
-        """Replace the checkpoint; a kill at any moment leaves the old or the new one."""
-        save_atomically(self.checkpoint_file, state)
+        """Replace the checkpoint, and keep the one before it.
 
-    def load_checkpoint(self) -> dict[str, Any] | None:
-        """The last checkpoint, or ``None`` if there is none yet."""
-        if not self.checkpoint_file.exists():
-            return None
-        state: dict[str, Any] = torch.load(
-            self.checkpoint_file, weights_only=True, map_location="cpu"
-        )
+        A kill at any moment leaves the old or the new one.
+        """
+        keep = self.previous_file if self.last_is_good else None
+        write_atomically(self.checkpoint_file, saved(state), keep)
+        self.last_is_good = True
+
+    def load_checkpoint(
+        self,
+        config: Mapping[str, Any] | None = None,
+        say: Callable[[str], object] = lambda line: print(line, file=sys.stderr),
+    ) -> dict[str, Any] | None:
+        """The last checkpoint that can be read, or ``None`` if there is none yet.
+
+        Args:
+            config: of the run; that of the directory by default.
+            say: told in a line where it is not the last one, or of another version of torch.
+
+        Raises:
+            RunDirectoryError: if none can be read though there are results, or if it is of another
+                configuration.
+        """
+        problems = []
+        state: dict[str, Any] | None = None
+        for file in (self.checkpoint_file, self.previous_file):
+            if not (file.exists() or file.is_symlink()):
+                problems.append(f"{file} is missing")
+                continue
+            try:
+                state = read_checkpoint(file)
+            except RunDirectoryError as error:
+                problems.append(str(error))
+                continue
+            self._check_checkpoint(file, state, self._stored() if config is None else config, say)
+            break
+        self.last_is_good = state is not None and not problems
+        if state is not None and problems:
+            done = len(state["metrics"])
+            say(f"{problems[0]}; {self.previous_file.name} is used, of {done} iterations")
+        if state is None and self._has_results():
+            raise RunDirectoryError(
+                f"{'; '.join(problems)}; but there are results, which are left as they are: choose "
+                "another run_dir to start over"
+            )
+        if state is None and self.checkpoint_file.exists():
+            say(f"{problems[0]}; the run starts over")
         return state
+
+    def _has_results(self) -> bool:
+        names = (*_TABLES, *_WEIGHTS)
+        return any((self.path / n).exists() and (self.path / n).stat().st_size for n in names)
+
+    def _check_checkpoint(
+        self,
+        file: Path,
+        state: Mapping[str, Any],
+        config: Mapping[str, Any],
+        say: Callable[[str], object],
+    ) -> None:
+        """Older checkpoints do not say what they are of."""
+        settings = state.get("settings")
+        if isinstance(settings, dict) and config:
+            different = differences(settings, config, may_grow=True)
+            if different:
+                raise RunDirectoryError(
+                    f"{file} is of another configuration: {_shortened(different)}; put the run's "
+                    "own back, or choose another run_dir"
+                )
+        other = state.get("torch")
+        if other is not None and other != str(torch.__version__):
+            say(f"{file} was written with torch {other}, this is {torch.__version__}")
+
+    def write_results(
+        self,
+        weights: Mapping[str, object],
+        rows: Sequence[Mapping[str, Any]],
+        timings: Sequence[Mapping[str, Any]],
+    ) -> None:
+        """Write all that follows from a checkpoint.
+
+        The metrics come last: whoever finds the last row takes the run for finished and never
+        comes back to it.
+        """
+        for file, content in self._results(weights, rows, timings).items():
+            write_atomically(file, content)
+
+    def restore_results(
+        self,
+        weights: Mapping[str, object],
+        rows: Sequence[Mapping[str, Any]],
+        timings: Sequence[Mapping[str, Any]],
+    ) -> list[str]:
+        """Write what is not as the checkpoint says; the names of these files."""
+        restored = []
+        for file, content in self._results(weights, rows, timings).items():
+            try:
+                as_it_was = file.is_file() and file.read_bytes() == content
+            except OSError:
+                as_it_was = False
+            if not as_it_was:
+                write_atomically(file, content)
+                restored.append(file.name)
+        return restored
+
+    def mark_diverged(self, line: str, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Say that the run has stopped after these rows, the last of which gets a mark."""
+        write_atomically(self.diverged_file, line + "\n")
+        if not rows:
+            return
+        text = table_text([*rows[:-1], {**rows[-1], "diverged": 1}])
+        checksums = self._checksums()
+        known = checksums.get(self.metrics_file.name)
+        known = known if isinstance(known, dict) else {}
+        checksums[self.metrics_file.name] = {**known, str(len(rows)): digest(text)}
+        write_atomically(self.checksums_file, json.dumps(checksums, indent=2))
+        write_atomically(self.metrics_file, text)
+
+    def _results(
+        self,
+        weights: Mapping[str, object],
+        rows: Sequence[Mapping[str, Any]],
+        timings: Sequence[Mapping[str, Any]],
+    ) -> dict[Path, bytes]:
+        """Contents of files, in the order in which they are to be written."""
+        files = {self.path / f"{name}.pt": saved(state) for name, state in weights.items()}
+        checksums: dict[str, Any] = {file.name: digest(content) for file, content in files.items()}
+        checksums[self.checkpoint_file.name] = self.checkpoint_file.stat().st_size
+        tables = {self.timing_file: timings, self.metrics_file: rows}
+        texts = {file: table_text(table) for file, table in tables.items()}
+        for file, table in tables.items():
+            # The one before stands until this one is there.
+            before = {str(len(table) - 1): digest(table_text(table[:-1]))} if table[1:] else {}
+            checksums[file.name] = {**before, str(len(table)): digest(texts[file])}
+        return {
+            **files,
+            self.timing_file: texts[self.timing_file].encode(),
+            self.checksums_file: json.dumps(checksums, indent=2).encode(),
+            self.metrics_file: texts[self.metrics_file].encode(),
+        }
+
+
+def _shortened(items: Sequence[str], most: int = 8) -> str:
+    """A list in one line."""
+    rest = f"; and {len(items) - most} more" if len(items) > most else ""
+    return "; ".join(items[:most]) + rest
 
 
 def differences(
@@ -249,36 +426,6 @@ def differences(
     ]
 
 
-def write_table(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a whole CSV atomically; columns in order of first appearance."""
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomically(file, text.getvalue())
-
-
-def write_atomically(file: Path, text: str) -> None:
-    """Replace a text file in one step."""
-    temporary = file.with_name(file.name + ".tmp")
-    with temporary.open("w", encoding="utf-8") as handle:
-        handle.write(text)
-        handle.flush()
-        os.fsync(handle.fileno())
-    os.replace(temporary, file)
-
-
-def save_atomically(file: Path, state: object) -> None:
-    """Replace a ``torch.save`` file in one step."""
-    temporary = file.with_name(file.name + ".tmp")
-    with temporary.open("wb") as handle:
-        torch.save(state, handle)
-        handle.flush()
-        os.fsync(handle.fileno())
-    os.replace(temporary, file)
-
-
 def run_directories(folder: Path) -> Iterator[tuple[Path, dict[str, Any] | RunDirectoryError]]:
     """Every run directory in or below a folder, with its configuration or why that is unreadable.
 
@@ -306,7 +453,10 @@ def read_config(file: Path) -> dict[str, Any]:
         RunDirectoryError: if the file cannot be read.
     """
     try:
-        config = OmegaConf.to_container(OmegaConf.load(file))
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise RunDirectoryError(f"cannot read {file}: {error}") from error
+        config = OmegaConf.to_container(OmegaConf.create(yaml_text(file)))
+    except (yaml.YAMLError, RecursionError) as error:
+        raise RunDirectoryError(f"cannot read {file}: {problem(error)}") from error
+    # OmegaConf's own errors come in many kinds.
+    except Exception as error:
+        raise RunDirectoryError(f"cannot read {file}: {message(error)}") from error
     return {str(k): v for k, v in config.items()} if isinstance(config, dict) else {}

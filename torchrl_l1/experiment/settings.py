@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, is_dataclass
+from difflib import get_close_matches
 from functools import cache
 from typing import Any, ClassVar
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 
 from torchrl_l1.algorithms import (
     MBMF,
@@ -27,6 +28,7 @@ from torchrl_l1.checks import check_choice, check_count, check_optional_count
 from torchrl_l1.compilation import check_mode
 from torchrl_l1.control import L1Config
 from torchrl_l1.envs import get_task
+from torchrl_l1.experiment.files import bounded_overrides
 
 
 @dataclass
@@ -100,11 +102,12 @@ class RunSettings(ABC):
         recipe: the recipe's name, as given on the command line.
         task: a task of :data:`torchrl_l1.envs.TASKS`.
         seed: seed of every random stream.
-        run_dir: where the run's files go.
+        run_dir: where the run's files go; a long list of overrides is shortened in its name.
         resume: continue the run in ``run_dir`` from its last checkpoint.
         threads: CPU threads of torch.
         device: ``cpu``, ``cuda`` or ``auto`` (CUDA where there is one).
         horizon: steps per real episode; the task's own if null.
+        on_divergence: ``stop`` or ``warn`` where losses, weights or plans are no longer finite.
         l1: see :class:`L1Settings`.
         perturbation: noise and disturbances of the real environment.
         wandb: see :class:`WandbSettings`.
@@ -115,11 +118,12 @@ class RunSettings(ABC):
     recipe: str = MISSING
     task: str = MISSING
     seed: int = 0
-    run_dir: str = "runs/${recipe}/${hydra:job.override_dirname}/seed_${seed}"
+    run_dir: str = "runs/${recipe}/${bounded:${hydra:job.override_dirname}}/seed_${seed}"
     resume: bool = False
     threads: int = 1
     device: str = "cpu"
     horizon: int | None = None
+    on_divergence: str = "stop"
     l1: L1Settings = field(default_factory=L1Settings)
     perturbation: Perturbation = field(default_factory=Perturbation)
     wandb: WandbSettings = field(default_factory=WandbSettings)
@@ -145,6 +149,7 @@ class RunSettings(ABC):
         check_choice("device", self.device, DEVICES)
         check_count("threads", self.threads)
         check_optional_count("horizon", self.horizon)
+        check_choice("on_divergence", self.on_divergence, ("stop", "warn"))
 
     @abstractmethod
     def collected_episodes(self, iterations: int) -> int:
@@ -161,7 +166,7 @@ class RunSettings(ABC):
             ValueError: if settings contradict each other.
         """
         config = self.builds.config_class
-        return self.builds(
+        algorithm = self.builds(
             self.task,
             config(**{part.name: getattr(self, part.name) for part in fields(config)}),
             l1_config(self.l1, self.task),
@@ -171,10 +176,15 @@ class RunSettings(ABC):
             device=self.device,
             compile_l1=check_mode(self.l1.compile, "l1.compile"),
         )
+        algorithm.stops_on_divergence = self.on_divergence == "stop"
+        return algorithm
 
+
+# Not in ``register``: launchers resolve it in processes of their own.
+OmegaConf.register_new_resolver("bounded", bounded_overrides, replace=True)
 
 # Keys that may differ between a run and its continuation: they do not touch the result.
-VOLATILE_KEYS = ("run_dir", "resume", "wandb")
+VOLATILE_KEYS = ("run_dir", "resume", "wandb", "on_divergence")
 
 
 def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
@@ -190,6 +200,40 @@ def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
     for key, value in node.items():
         flat.update(flatten(value, f"{prefix}.{key}" if prefix else str(key)))
     return flat
+
+
+def check_known(config: DictConfig) -> None:
+    """Make sure that a composed recipe has a schema and no key that this does not know.
+
+    Hydra lets ``+key=value`` add one, which nobody would read.
+
+    Raises:
+        ValueError: naming the key.
+    """
+    kind = OmegaConf.get_type(config)
+    if not (isinstance(kind, type) and issubclass(kind, RunSettings)):
+        raise ValueError(
+            "the recipe has no schema; put that of its algorithm, such as metrpo_recipe, first in "
+            "its defaults"
+        )
+    known: list[str] = []
+    for key in _unknown(config, "", known):
+        close = get_close_matches(key, known, n=1)
+        hint = f"; did you mean {close[0]}?" if close else ""
+        raise ValueError(f"there is no key {key!r}, and + adds none{hint}")
+
+
+def _unknown(node: DictConfig, prefix: str, known: list[str]) -> list[str]:
+    kind = OmegaConf.get_type(node)
+    named = {part.name for part in fields(kind)} if is_dataclass(kind) else None
+    found = []
+    known += [prefix + name for name in named or ()]
+    for key in node:
+        if named is not None and key not in named and not (key == "hydra" and not prefix):
+            found.append(f"{prefix}{key}")
+        elif isinstance(part := node._get_node(key), DictConfig) and key != "hydra":
+            found += _unknown(part, f"{prefix}{key}.", known)
+    return found
 
 
 def l1_config(settings: L1Settings, task_name: str) -> L1Config | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from torchrl_l1.report.build import report
+from torchrl_l1.report.fit import draw_fit_quality
 from torchrl_l1.report.published import (
     Curves,
     PublishedCell,
@@ -22,6 +23,7 @@ __all__ = [
     "ReferenceCurves",
     "Run",
     "Study",
+    "draw_fit_quality",
     "find_runs",
     "published_cell",
     "published_cells",

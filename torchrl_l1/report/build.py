@@ -12,11 +12,12 @@ from typing import Any
 
 from torchrl_l1.campaign import read_campaign
 from torchrl_l1.campaign.description import load_yaml
+from torchrl_l1.experiment.errors import RunDirectoryError, message
+from torchrl_l1.experiment.files import refuse_link, write_atomically
 from torchrl_l1.experiment.recipes import available_campaigns
-from torchrl_l1.experiment.run_directory import write_atomically
 from torchrl_l1.report.comparison import algorithm_sections
 from torchrl_l1.report.evaluations import evaluation_sections
-from torchrl_l1.report.page import Page, markdown
+from torchrl_l1.report.page import Page, markdown, plain
 from torchrl_l1.report.published import ReferenceCurves
 from torchrl_l1.report.runs import Findings, Run, find_readable_runs
 from torchrl_l1.report.study import Study, studies
@@ -59,6 +60,8 @@ def report(
         ValueError: if the output folder is a run directory, or the curves cannot be read.
     """
     output = folders[0] / "report" if output is None else output
+    if (folders[0] / "config.yaml").exists() and output.parent == folders[0]:
+        refuse_link(output)
     if (output / "config.yaml").exists():
         raise ValueError(f"{output} is a run directory; choose another --output")
     if output.exists() and not output.is_dir():
@@ -66,7 +69,7 @@ def report(
     reference = None if reference_curves is None else ReferenceCurves(reference_curves)
     found = find_readable_runs(folders)
     runs = found.runs
-    campaigns = find_campaigns(folders, runs)
+    campaigns = find_campaigns(folders, runs, found.errors)
     every = studies(runs)
     output.mkdir(parents=True, exist_ok=True)
 
@@ -92,19 +95,22 @@ def _introduction(page: Page, every: Sequence[Study], found: Findings, command: 
         f"{len(runs)} runs, of which {len(runs) - unfinished} are finished; only "
         "these enter means, intervals and differences. Every run's settings are in the "
         "`config.yaml` of its directory.",
-        f"```console\n$ {command}\n```",
+        f"```console\n$ {_one_line(command)}\n```",
     )
     page.text(_algorithms(every))
     page.csv("runs", _run_rows(every))
     duplicates = [run for study in every for run in study.duplicates]
     if duplicates:
-        left_out = "\n".join(f"- {run.path}" for run in duplicates)
+        left_out = "\n".join(f"- {plain(run.path)}" for run in duplicates)
         page.text(
             "Left out, since another run has the same settings and seed (what it was evaluated in "
             f"and the other was not counts for the other):\n\n{left_out}"
         )
+    diverged = "\n".join(f"- {plain(r.path)}: {plain(r.diverged)}" for r in runs if r.diverged)
+    if diverged:
+        page.text(f"Trainings that diverged:\n\n{diverged}")
     if found.errors:
-        errors = "\n".join(f"- {error}" for error in found.errors)
+        errors = "\n".join(f"- {plain(error)}" for error in found.errors)
         page.text(f"Left out, since they cannot be read:\n\n{errors}")
 
 
@@ -156,11 +162,15 @@ class CampaignState:
     begun: int
 
 
-def find_campaigns(folders: Sequence[Path], runs: Sequence[Run]) -> list[CampaignState]:
+def find_campaigns(
+    folders: Sequence[Path], runs: Sequence[Run], errors: list[RunDirectoryError]
+) -> list[CampaignState]:
     """Every ``campaign.yaml`` in or below some folders.
 
-    Raises:
-        ValueError: if one of them is no campaign file.
+    Args:
+        folders: where to look.
+        runs: those that there are.
+        errors: what is wrong with those that are no campaign file joins these.
     """
     found: dict[Path, CampaignState] = {}
     for folder in folders:
@@ -168,7 +178,10 @@ def find_campaigns(folders: Sequence[Path], runs: Sequence[Run]) -> list[Campaig
             inside_a_run = "config.yaml" in files
             below[:] = sorted(n for n in below if not (n.startswith(".") or inside_a_run))
             if "campaign.yaml" in files and Path(path).resolve() not in found:
-                found[Path(path).resolve()] = _read_campaign(Path(path), runs)
+                try:
+                    found[Path(path).resolve()] = _read_campaign(Path(path), runs)
+                except (OSError, ValueError) as error:
+                    errors.append(RunDirectoryError(message(error)))
     return list(found.values())
 
 
@@ -179,7 +192,7 @@ def _read_campaign(folder: Path, runs: Sequence[Run]) -> CampaignState:
         name = str(content.get("name", folder.name))
         matrices = [entry["matrix"] for entry in content["runs"]]
         expected = sum(math.prod(map(len, matrix.values())) for matrix in matrices)
-    except (AttributeError, KeyError, TypeError) as error:
+    except (AttributeError, IndexError, KeyError, TypeError) as error:
         raise ValueError(f"{file} is no campaign file: {error!r}") from error
     given: str | Path = file
     if name in available_campaigns():
@@ -197,6 +210,10 @@ def _read_campaign(folder: Path, runs: Sequence[Run]) -> CampaignState:
     )
 
 
+def _one_line(command: str) -> str:
+    return " ".join(command.split()).replace("```", "'''")
+
+
 def _campaigns(page: Page, campaigns: Sequence[CampaignState]) -> None:
     """How far each campaign is, and the command behind it."""
     for campaign in campaigns:
@@ -205,8 +222,8 @@ def _campaigns(page: Page, campaigns: Sequence[CampaignState]) -> None:
         state += f", {campaign.begun} unfinished" * (campaign.begun > 0)
         state += f", {left} not begun" * (left > 0)
         page.text(
-            f"Campaign **{campaign.name}** ({state}). {campaign.description}".strip(),
-            f"```console\n$ {campaign.command}\n```",
+            f"Campaign **{plain(campaign.name)}** ({state}). {plain(campaign.description)}".strip(),
+            f"```console\n$ {_one_line(campaign.command)}\n```",
         )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchrl_l1.experiment.run_directory import write_table
+from torchrl_l1.experiment.files import bounded, write_table
 from torchrl_l1.report.style import named
 
 Row = Mapping[str, Any]
@@ -40,12 +40,12 @@ class Page:
         return part
 
     def file(self, *words: str, suffix: str = ".png") -> Path:
-        """Where a file of this part goes."""
-        return self.folder / f"{slug((self.name, *words))}{suffix}"
+        """Where a file of this part goes; a long name is cut, and ends in its digest."""
+        return self.folder / f"{bounded(slug((self.name, *words)))}{suffix}"
 
     def heading(self, text: str, how_to_read: str) -> None:
         """Begin a section with a sentence on how to read it."""
-        self.text(f"## {named(self.name, text)}")
+        self.text(f"## {named(self.name, ' '.join(text.split()))}")
         self.text(how_to_read)
 
     def text(self, *blocks: str) -> None:
@@ -55,18 +55,50 @@ class Page:
     def csv(self, name: str, rows: Sequence[Row]) -> None:
         """Write a table in full precision and name it."""
         prefix = f"{slug((self.name,))}_" if self.name else ""
-        file = self.folder / f"{prefix}{name}.csv"
-        write_table(file, rows)
+        file = self.folder / f"{bounded(prefix + name)}.csv"
+        write_table(file, [{key: _cell(value) for key, value in row.items()} for row in rows])
         self.text(f"All columns: [{file.name}](./{file.name}).")
 
     def figure(self, file: Path | None, caption: str) -> None:
         """Show a figure; nothing if there was nothing to draw."""
         if file is not None:
-            self.text(f"![{named(self.name, caption)}]({file.name})")
+            self.text(f"![{plain(named(self.name, caption))}]({file.name})")
 
     def render(self) -> str:
         """The Markdown."""
         return "\n\n".join(self._blocks) + "\n"
+
+
+def plain(text: object) -> str:
+    r"""Text from a file, as it is, on one line of Markdown.
+
+    Examples:
+        >>> print(plain("a | b <script> ![x](http://y)"))
+        a \| b &lt;script&gt; !\[x\](http://y)
+    """
+    line = " ".join(re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+", " ", str(text)).split())
+    line = line.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    line = re.sub(r"[\\`*|]", r"\\\g<0>", line)
+    # Brackets mean nothing but before another one, or in front of an address.
+    return re.sub(r"\[(?=[^\]]*\][(\[])|\](?=[(\[])", r"\\\g<0>", line)
+
+
+def code(text: object) -> str:
+    """Text from a file as code.
+
+    Examples:
+        >>> code("l1.epsilon=0.1")
+        '`l1.epsilon=0.1`'
+    """
+    line = " ".join(re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+", " ", str(text)).split())
+    return f"`{line.replace('`', chr(39)).replace('|', chr(166))}`"
+
+
+def _cell(value: object) -> object:
+    """A value of a CSV: text that a spreadsheet would take for a formula is quoted."""
+    if isinstance(value, str) and re.match(r"[=+@\t\r]|-(?![\d.])", value):
+        return f"'{value}"
+    return value
 
 
 def slug(words: Sequence[str]) -> str:
@@ -88,7 +120,7 @@ def markdown(rows: Sequence[Mapping[str, str]]) -> str:
         return ""
     columns = [key for key in rows[0] if any(row[key] not in ("", "–") for row in rows)]
     lines = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
-    lines += [f"| {' | '.join(row[key] for key in columns)} |" for row in rows]
+    lines += [f"| {' | '.join(plain(row[key]) for key in columns)} |" for row in rows]
     return "\n".join(lines)
 
 

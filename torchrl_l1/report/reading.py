@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +18,7 @@ from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.evaluate import episodes_file
+from torchrl_l1.experiment.files import read_text
 from torchrl_l1.experiment.matrix import Condition
 
 SWITCH_RATE = "l1/switch_rate"
@@ -23,6 +26,9 @@ SWITCH_RATE = "l1/switch_rate"
 
 SIGNALS = (SWITCH_RATE, "l1/u_a", "l1/saturation")
 """Columns of a metrics table that only runs with L1 have."""
+
+# No table of a run comes near; more would be read into memory whole.
+_MOST_BYTES = 200_000_000
 
 _METRICS = ("iteration", "real_steps", "return_mean", "return_deterministic")
 
@@ -199,8 +205,10 @@ def read_versions(file: Path) -> dict[str, str]:
     if not file.exists():
         return {}
     try:
-        versions = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        versions = json.loads(read_text(file, _MOST_BYTES))
+        if not isinstance(versions, dict):
+            raise ValueError("it holds no names and versions")
+    except (OSError, ValueError, RecursionError) as error:
         raise RunDirectoryError(f"cannot read {file}: {error}") from error
     return {str(key): str(value) for key, value in versions.items()}
 
@@ -226,12 +234,11 @@ def numeric_rows(
             else; the message names file and line.
     """
     try:
-        with file.open(newline="", encoding="utf-8") as handle:
-            reader = csv.DictReader(handle, strict=True)
-            missing = [k for k in (*words, *numbers) if k not in (reader.fieldnames or ())]
-            if missing:
-                raise ValueError(f"{file} has no column {', '.join(missing)}")
-            rows = list(reader)
+        reader = csv.DictReader(io.StringIO(read_text(file, _MOST_BYTES), newline=""), strict=True)
+        missing = [k for k in (*words, *numbers) if k not in (reader.fieldnames or ())]
+        if missing:
+            raise ValueError(f"{file} has no column {', '.join(missing)}")
+        rows = list(reader)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"cannot read {file}: {error}") from error
     return [
@@ -239,7 +246,10 @@ def numeric_rows(
             **{key: _word(file, line, key, row[key]) for key in words},
             **{key: _number(file, line, key, row[key]) for key in numbers},
             **{key: _value(row.get(key)) for key in optional},
-            **{key: row.get(key) or "" for key in optional_words},
+            **{
+                key: _word(file, line, key, row[key]) if row.get(key) else ""
+                for key in optional_words
+            },
         }
         for line, row in enumerate(rows, start=2)
     ]
@@ -248,6 +258,8 @@ def numeric_rows(
 def _word(file: Path, line: int, key: str, text: str | None) -> str:
     if not text:
         raise ValueError(f"{file}, line {line}: {key} is empty")
+    if not re.fullmatch(r"[^\x00-\x1f<>|`\\\[\]]{1,100}", text):
+        raise ValueError(f"{file}, line {line}: {key} is {text[:40]!r}, which is no word")
     return text
 
 

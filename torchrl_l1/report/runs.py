@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -12,7 +13,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from torchrl_l1.algorithms.facts import MEASURING, WINDOW
-from torchrl_l1.experiment.errors import RunDirectoryError
+from torchrl_l1.experiment.errors import RunDirectoryError, message
+from torchrl_l1.experiment.files import read_text
 from torchrl_l1.experiment.run_directory import RunDirectory, run_directories
 from torchrl_l1.report.identity import Identity, facts, identify
 from torchrl_l1.report.reading import (
@@ -53,6 +55,7 @@ class Run:
         evaluations: by name of the evaluation.
         stage: number ``(T,)`` of the stage that each outer iteration belongs to, from 1; ``None``
             where the algorithm has one only.
+        diverged: what is no longer finite in its training; empty if all is well.
     """
 
     path: Path
@@ -65,6 +68,7 @@ class Run:
     versions: dict[str, str] = field(default_factory=dict)
     evaluations: dict[str, list[Evaluation]] = field(default_factory=dict)
     stage: np.ndarray | None = None
+    diverged: str = ""
 
     @property
     def finished(self) -> bool:
@@ -199,12 +203,29 @@ def find_readable_runs(folders: Sequence[Path]) -> Findings:
     return found
 
 
+def _read_table(file: Path) -> list[Evaluation]:
+    """An evaluation whose name is a word, as campaigns ask for: it goes into names and headings."""
+    if not re.fullmatch(r"[A-Za-z0-9_.+-]{1,100}", file.stem):
+        raise RunDirectoryError(f"cannot use {file}: its name is no word of at most 100 letters")
+    return read_evaluations(file)
+
+
+def _diverged(file: Path) -> str:
+    try:
+        return read_text(file, 10_000).strip() if file.exists() else ""
+    except (OSError, ValueError) as error:
+        raise RunDirectoryError(f"cannot read {file}: {error}") from error
+
+
 def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirectoryError]) -> Run:
     try:
         identity = identify(config)
         algorithm = facts(identity.algorithm)
-    except (KeyError, TypeError, ValueError) as error:
-        raise RunDirectoryError(f"cannot use {directory.config_file}: {error}") from error
+    # A damaged configuration may hold anything anywhere.
+    except Exception as error:
+        raise RunDirectoryError(f"cannot use {directory.config_file}: {message(error)}") from error
+    if problem := directory.metrics_problem():
+        raise RunDirectoryError(problem)
     columns = read_metrics(directory.metrics_file, len(algorithm.named_stages))
     iterations = len(columns["iteration"])
     if iterations > identity.outer_iterations:
@@ -223,7 +244,7 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
     path = directory.path
     tables = sorted((path / "evaluations").glob("*.csv"))
     evaluations: dict[str, list[Evaluation]] = {
-        file.stem: readable(partial(read_evaluations, file), []) for file in tables
+        file.stem: readable(partial(_read_table, file), []) for file in tables
     }
     return Run(
         path,
@@ -239,4 +260,5 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
         readable(partial(read_versions, path / "versions.json"), {}),
         {k: distinct_policies(tests, algorithm) for k, tests in evaluations.items() if tests},
         columns.get("stage"),
+        readable(partial(_diverged, directory.diverged_file), ""),
     )

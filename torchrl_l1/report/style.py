@@ -19,6 +19,9 @@ from matplotlib.figure import Figure
 from torchrl_l1.algorithms.collection import ORACLE
 from torchrl_l1.report.identity import BASELINE
 
+# Labels hold values from files: what stands between dollars is no formula.
+matplotlib.rcParams["text.parse_math"] = False
+
 # Okabe and Ito: told apart with any colour vision. Grey is kept for the authors' curves.
 _ARMS = {"off": "#D55E00", "paper": "#0072B2", "reference": "#009E73", "slow": "#CC79A7"}
 _ARMS[ORACLE] = "#000000"

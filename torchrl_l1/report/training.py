@@ -16,6 +16,7 @@ from torchrl_l1.report.page import (
     Footnotes,
     Page,
     Row,
+    code,
     difference_columns,
     interval_text,
     markdown,
@@ -34,6 +35,9 @@ from torchrl_l1.report.statistics import (
 )
 from torchrl_l1.report.study import Cell, Study, place_columns, with_baselines
 from torchrl_l1.report.style import arm_label, color, named, title
+
+# More settings are told in the text and in the table, not in headings and legends.
+_MOST_KEYS, _LONGEST_LABEL = 6, 100
 
 
 def training_sections(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
@@ -89,9 +93,9 @@ def _main_settings(study: Study) -> str:
             shared = study.main_settings(task)
             for key, value in study.main_settings(task, cell.arm).items():
                 where = "" if key in shared else f" (L1 {cell.arm})"
-                settings[f"`{key}={value}`{where}"] = None
+                settings[f"{code(f'{key}={value}')}{where}"] = None
             for key, value in study.cells[cell][0].identity.departures.items():
-                settings[f"`{key}={value}` (L1 {cell.arm})"] = None
+                settings[f"{code(f'{key}={value}')} (L1 {cell.arm})"] = None
         if settings:
             lines.append(f"- {task}: {', '.join(settings)}")
     if not lines:
@@ -265,8 +269,10 @@ def _comparisons(page: Page, study: Study, reference: ReferenceCurves | None) ->
     for keys in study.comparisons():
         cells = study.compared(keys)
         page.heading(
-            f"By {' and '.join(f'`{key}`' for key in keys)}",
-            "The same table for runs that depart from the main ones in these settings, and the "
+            f"By {_keys_text(keys)}",
+            f"The settings are {', '.join(map(code, keys))}. "
+            * (len(keys) > _MOST_KEYS)
+            + "The same table for runs that depart from the main ones in these settings, and the "
             "main ones of the same task and noise."
             + " It is the comparison of the paper's Figure 2."
             * ("model.form" in keys and study.facts.compares_models),
@@ -280,7 +286,8 @@ def _comparisons(page: Page, study: Study, reference: ReferenceCurves | None) ->
         for task in dict.fromkeys(cell.task for cell in cells):
             file = page.file("by", *keys, task)
             figure = plot_comparison(study, task, keys, file, reference, page.name)
-            page.figure(figure, f"Learning curves by {', '.join(keys)}, {title(task)}")
+            shown = ", ".join(keys) if len(keys) <= _MOST_KEYS else _keys_text(keys)
+            page.figure(figure, f"Learning curves by {shown}, {title(task)}")
 
 
 def plot_comparison(
@@ -299,7 +306,8 @@ def plot_comparison(
         the file, or ``None`` if no run has finished an iteration.
     """
     cells = [cell for cell in study.compared(keys) if cell.task == task]
-    names = {cell: _name(study, cell, keys) for cell in cells}
+    rows = {cell: row for row, cell in enumerate(study.compared(keys), start=1)}
+    names = {cell: _name(study, cell, keys, rows[cell]) for cell in cells}
     order = list(dict.fromkeys(names.values()))
     panels = []
     for noise in dict.fromkeys(cell.noise for cell in cells):
@@ -318,8 +326,16 @@ def plot_comparison(
     return plot_panels(panels, file)
 
 
-def _name(study: Study, cell: Cell, keys: Sequence[str]) -> str:
-    return ", ".join(filter(None, (arm_label(cell.arm), study.describe(cell, keys))))
+def _name(study: Study, cell: Cell, keys: Sequence[str], row: int) -> str:
+    """In the legend: the settings, or the row of the table where they are many."""
+    settings = study.describe(cell, keys)
+    if len(settings) > _LONGEST_LABEL:
+        settings = f"{settings[:_LONGEST_LABEL]} ... (row {row} of the table)"
+    return ", ".join(filter(None, (arm_label(cell.arm), settings)))
+
+
+def _keys_text(keys: Sequence[str]) -> str:
+    return " and ".join(map(code, keys)) if len(keys) <= _MOST_KEYS else f"{len(keys)} settings"
 
 
 def _time(page: Page, study: Study) -> None:

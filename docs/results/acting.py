@@ -1,0 +1,152 @@
+"""Rules by which the robust controller acts on its estimate, compared on frozen policies.
+
+    python docs/results/acting.py RUN [RUN ...]
+
+Every rule gets the same posterior mean d and standard deviation s of the disturbance, from the same
+Kalman filter, and says what the input cancels. Writes `acting.csv` and `acting.md` beside this
+file: returns of 24 episodes of the policy's mean action, paired by their resets with L1 off.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_l1.algorithms.collection import episode_returns
+from torchrl_l1.control import kalman
+from torchrl_l1.experiment.evaluate import TrainedRun, load_run, make_collection
+from torchrl_l1.experiment.matrix import Condition
+from torchrl_l1.experiment.run_directory import write_table
+from torchrl_l1.report.page import markdown
+
+HERE = Path(__file__).parent
+EPISODES, SEED = 24, 0
+CONDITIONS: dict[str, dict[str, Any]] = {
+    "undisturbed": {},
+    "action noise": {"noise": "action"},
+    "observation noise": {"noise": "observation"},
+    "bias 0.2": {"disturbances": {"bias": 0.2}},
+    "bias -0.4": {"disturbances": {"bias": -0.4}},
+    "step 0.2": {"disturbances": {"step": 0.2}},
+}
+Rule = Callable[[kalman.Posterior], Tensor]
+shipped = kalman.significant
+
+
+def _deviation(posterior: kalman.Posterior) -> Tensor:
+    return posterior.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+
+
+def shrunk(posterior: kalman.Posterior) -> Tensor:
+    """The posterior mean of a normal prior as wide as the estimate: d / (1 + (s / d)^2)."""
+    square = posterior.mean.square()
+    return posterior.mean * square / (square + _deviation(posterior).square()).clamp_min(1e-12)
+
+
+def soft(posterior: kalman.Posterior) -> Tensor:
+    """Two standard deviations subtracted from the magnitude."""
+    size = (posterior.mean.abs() - 2 * _deviation(posterior)).clamp_min(0)
+    return posterior.mean.sign() * size
+
+
+def less_expected(expected: Tensor) -> Rule:
+    """The mean estimate of undisturbed episodes subtracted, entry by entry."""
+    return lambda posterior: posterior.mean - expected
+
+
+def rules(trained: TrainedRun) -> dict[str, Rule]:
+    """By name; the one that needs undisturbed episodes takes them from the policy itself."""
+    kalman.significant = lambda posterior, dead_zone: torch.zeros_like(posterior.mean)
+    idle = make_collection(trained, Condition("robust"), EPISODES).evaluate(SEED + 1)
+    expected = idle["next", "l1", "sigma_m"].flatten(0, -2).mean(0)
+    return {
+        "everything (z = 0)": lambda posterior: posterior.mean,
+        "dead zone, z = 1": lambda posterior: shipped(posterior, 1.0),
+        "dead zone, z = 2": lambda posterior: shipped(posterior, 2.0),
+        "dead zone, z = 3": lambda posterior: shipped(posterior, 3.0),
+        "soft threshold, z = 2": soft,
+        "shrinkage": shrunk,
+        "expected estimate subtracted": less_expected(expected),
+    }
+
+
+def compare(trained: TrainedRun) -> list[dict[str, Any]]:
+    """One row per rule and condition of a run."""
+    rows = []
+    for name, test in CONDITIONS.items():
+        cell = {"policy": "deterministic", **test}
+        off = _returns(trained, Condition("off", **cell))
+        rows.append(_row(trained, name, "off", off, off))
+        for rule, function in rules(trained).items():
+            kalman.significant = lambda posterior, dead_zone, f=function: f(posterior)
+            rows.append(
+                _row(trained, name, rule, _returns(trained, Condition("robust", **cell)), off)
+            )
+        print(trained.path, name, [round(row["return"]) for row in rows[-8:]], flush=True)
+    return rows
+
+
+def _returns(trained: TrainedRun, cell: Condition) -> np.ndarray:
+    return episode_returns(make_collection(trained, cell, EPISODES).evaluate(SEED)).numpy()
+
+
+def _row(
+    trained: TrainedRun, name: str, rule: str, returns: np.ndarray, off: np.ndarray
+) -> dict[str, Any]:
+    difference = returns - off
+    return {
+        "task": trained.recipe.task,
+        "seed": trained.recipe.seed,
+        "condition": name,
+        "rule": rule,
+        "return": round(float(returns.mean()), 2),
+        "difference": round(float(difference.mean()), 2),
+        "standard_error": round(float(difference.std(ddof=1) / len(difference) ** 0.5), 2),
+    }
+
+
+def lines(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row per rule, a column per condition: mean over runs of the change, in % of undisturbed."""
+    found = []
+    undisturbed = {
+        (row["task"], row["seed"]): row["return"]
+        for row in rows
+        if (row["condition"], row["rule"]) == ("undisturbed", "off")
+    }
+    for rule in dict.fromkeys(row["rule"] for row in rows if row["rule"] != "off"):
+        line: dict[str, Any] = {"rule": rule}
+        for name in CONDITIONS:
+            changes = [
+                100 * row["difference"] / abs(undisturbed[row["task"], row["seed"]])
+                for row in rows
+                if (row["rule"], row["condition"]) == (rule, name)
+            ]
+            line[name] = f"{np.mean(changes):+.1f} ({min(changes):+.1f})"
+        found.append(line)
+    return found
+
+
+def main(runs: Sequence[str]) -> None:
+    """All of it."""
+    rows = [row for run in runs for row in compare(load_run(run))]
+    write_table(HERE / "acting.csv", rows)
+    policies = sorted({f"{row['task']} (seed {row['seed']})" for row in rows})
+    note = (
+        "Change of the return against L1 off, in % of the undisturbed return without L1: mean over "
+        f"the policies {', '.join(policies)}, in brackets the worst of them; {EPISODES} episodes "
+        "each."
+    )
+    (HERE / "acting.md").write_text(f"{markdown(lines(rows))}\n\n{note}\n")
+    print(f"Table: {HERE / 'acting.md'}")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
+    main(sys.argv[1:])

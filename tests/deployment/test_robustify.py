@@ -1,0 +1,140 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from torchrl.envs import EnvBase, GymEnv
+
+import torchrl_l1
+from torchrl_l1.control import L1Transform
+from torchrl_l1.deployment import RobustController, load_target, robustify
+from torchrl_l1.dynamics import FitConfig
+from torchrl_l1.envs import make_env
+from torchrl_l1.experiment.run import run
+
+from .conftest import balance
+
+TINY = {"environments": 2, "progress": False, "model": {"hidden": [4], "members": 1}}
+QUICK = FitConfig(max_epochs=1, batch_size=50)
+
+
+def test_one_call_from_a_policy_to_a_robust_one(robust):
+    assert torchrl_l1.robustify is robustify
+    assert robust.config.dt == 0.04 and robust.config.filter == "kalman"
+    assert robust.settings("paper").filter == "low_pass"
+    assert min(robust.model.quality.explained) > 0.8
+    env = robust.wrap(make_env("inverted_pendulum", 3, bias=0.5, seed=0))
+    assert isinstance(env.transform[-1], L1Transform)
+    data = env.rollout(60, robust.policy)
+    sent = data["next", "l1", "u_exec"] - data["action"]
+    # It finds the bias of 0.5, which nothing told it.
+    torch.testing.assert_close(sent[:, 40:].mean(), torch.tensor(-0.5), atol=0.1, rtol=0)
+
+
+@pytest.mark.filterwarnings("ignore:the model is too poor")
+def test_the_generator_of_the_caller_is_left_alone():
+    torch.manual_seed(5)
+    before = torch.random.get_rng_state()
+    made = [robustify("inverted_pendulum", balance, 60, fit=QUICK, **TINY) for _ in range(2)]
+    assert torch.equal(torch.random.get_rng_state(), before)
+    for one, other in zip(*(made[i].model.parameters() for i in (0, 1)), strict=True):
+        assert torch.equal(one, other)
+    assert made[0].configs == made[1].configs
+
+
+def test_what_is_saved_acts_the_same(robust, policy_file, tmp_path):
+    saved = replace(robust, origin={"policy": f"{policy_file}:balance"})
+    folder = saved.save(tmp_path / "controller")
+    assert not [file for file in folder.iterdir() if file.suffix in (".pt", ".pkl")]
+    loaded = RobustController.load(folder)
+    first, second = (
+        one.wrap(make_env("inverted_pendulum", 2, bias=0.5, seed=0)).rollout(20, one.policy)
+        for one in (robust, loaded)
+    )
+    assert torch.equal(first["next", "l1", "u_exec"], second["next", "l1", "u_exec"])
+    assert loaded.configs == robust.configs and loaded.preset == robust.preset
+    assert load_target(str(tmp_path)).configs == robust.configs
+
+
+def test_files_of_policies_go_into_the_folder(robust, tmp_path):
+    file = tmp_path / "policy.pt"
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.jit.script(torch.nn.Linear(4, 1)).save(str(file))
+    saved = replace(robust, origin={"policy": f"torchscript:{file}"})
+    folder = saved.save(tmp_path / "controller")
+    expected = file.read_bytes()
+    file.unlink()
+    loaded = RobustController.load(folder)
+    assert (folder / "policy.pt").read_bytes() == expected
+    moved = tmp_path / "elsewhere"
+    loaded.save(moved)
+    assert RobustController.load(moved).policy.rows is False
+
+
+def test_objects_are_asked_for_again(robust, tmp_path):
+    folder = robust.save(tmp_path)
+    with pytest.raises(ValueError, match="names no policy, which was an object"):
+        RobustController.load(folder)
+    assert RobustController.load(folder, policy=balance).configs == robust.configs
+    stored = json.loads((folder / "controller.json").read_text())
+    (folder / "controller.json").write_text(json.dumps({**stored, "format": 99}))
+    with pytest.raises(ValueError, match="has the format 99"):
+        RobustController.load(folder)
+    with pytest.raises(FileNotFoundError, match="holds no controller"):
+        RobustController.load(tmp_path / "nothing")
+
+
+def test_a_time_step_that_nobody_tells_must_be_given():
+    with pytest.raises(ValueError, match="give dt"):
+        robustify("MountainCarContinuous-v0", lambda x: x[..., :1], 10, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"preset": "best"}, "preset"),
+        ({"steps": 0}, "steps must be at least 1"),
+        ({"noise": -1.0}, "noise must be"),
+        ({"dt": 0.0}, "dt must be"),
+    ],
+)
+def test_settings_that_make_no_sense(settings, message):
+    with pytest.raises(ValueError, match=message):
+        robustify("inverted_pendulum", balance, **settings)
+
+
+def test_a_poor_model_is_noticed():
+    class Noise(torch.nn.Module):
+        def forward(self, x: torch.Tensor) -> torch.Tensor:
+            return torch.zeros_like(x[..., :1])
+
+    def make() -> EnvBase:
+        from torchrl.envs import TransformedEnv
+
+        from torchrl_l1.envs import ObservationNoise
+
+        return TransformedEnv(GymEnv("InvertedPendulum-v5"), ObservationNoise(2.0))
+
+    with pytest.warns(UserWarning, match="too poor for L1"):
+        robustify(make, Noise(), 200, dt=0.04, fit=QUICK, **{**TINY, "model": {"hidden": [4]}})
+
+
+def test_runs_bring_their_own_model_and_settings(tiny_recipe, tmp_path):
+    run(tiny_recipe("outer_iterations=1", "l1=paper", "l1.epsilon=0.7"))
+    robust = load_target(str(tmp_path / "run"))
+    assert robust.settings("paper").epsilon == 0.7
+    assert robust.config.filter == "kalman" and robust.source.name == "inverted_pendulum"
+    env = robust.wrap(robust.source.single())
+    assert env.rollout(3, robust.policy).shape == (1, 3)
+
+
+def test_targets_that_are_none(tmp_path):
+    with pytest.raises(ValueError, match="there is no folder"):
+        load_target("gymnasium/Pendulum-v1")
+    with pytest.raises(ValueError, match="leave --policy out"):
+        load_target(str(tmp_path), policy="sb3:x.zip")

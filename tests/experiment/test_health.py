@@ -1,0 +1,187 @@
+"""Trainings that diverge stop with a word, and signals end runs in order."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import DictConfig
+
+from torchrl_l1.algorithms import METRPO
+from torchrl_l1.algorithms.algorithm import Algorithm, Diverged
+from torchrl_l1.algorithms.model_learning import ModelLearning
+from torchrl_l1.algorithms.policy_improvement import PolicyImprovement
+from torchrl_l1.experiment.errors import RunDirectoryError
+from torchrl_l1.experiment.launch import compose
+from torchrl_l1.experiment.run import run
+from torchrl_l1.experiment.run_directory import RunDirectory
+from torchrl_l1.experiment.signals import RESUME_ME, orderly_end
+from torchrl_l1.report import report
+
+Recipe = Callable[..., DictConfig]
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    with (folder / "metrics.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def spoil_model(monkeypatch: pytest.MonkeyPatch, at: int) -> None:
+    """From its n-th fit on a model has weights that are no numbers."""
+    fit, count = ModelLearning.fit, iter(range(1000))
+
+    def spoilt(self: ModelLearning, *arguments: Any) -> Any:
+        found = fit(self, *arguments)
+        if next(count) >= at:
+            with torch.no_grad():
+                next(self.dynamics.parameters()).fill_(math.nan)
+        return found
+
+    monkeypatch.setattr(ModelLearning, "fit", spoilt)
+
+
+def test_a_model_of_no_numbers_stops_the_run_at_its_last_good_checkpoint(
+    tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    healthy = run(tiny_recipe(f"run_dir={tmp_path / 'healthy'}"))
+    assert "diverged" not in rows(healthy)[0]
+    spoil_model(monkeypatch, at=1)
+    with pytest.raises(RunDirectoryError, match=r"iteration 1, fit: weights of the model.*fit\.l"):
+        run(tiny_recipe())
+    folder = tmp_path / "run"
+    (row,) = rows(folder)
+    assert row["diverged"] == "1"
+    assert RunDirectory(folder).iterations_done() == 1 and RunDirectory(folder).intact()
+    assert "weights of the model" in (folder / "diverged.txt").read_text()
+    text = report([folder], tmp_path / "report").read_text()
+    assert f"Trainings that diverged:\n\n- {folder}: training diverged in iteration 1" in text
+    monkeypatch.undo()
+    run(tiny_recipe("resume=true"))
+    assert (folder / "metrics.csv").read_bytes() == (healthy / "metrics.csv").read_bytes()
+    assert not (folder / "diverged.txt").exists()
+
+
+@pytest.mark.parametrize("kind", ["loss", "advantage", "kl"])
+def test_what_is_not_finite_in_fit_and_policy_step_is_named(
+    kind: str, tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if kind == "loss":
+        fit = ModelLearning.fit
+
+        def spoilt(self: Any, *arguments: Any) -> Any:
+            found = fit(self, *arguments)
+            found.validation_loss = math.inf
+            return found
+
+        monkeypatch.setattr(ModelLearning, "fit", spoilt)
+        words = r"fit: model/validation_loss is inf; look at fit\.learning_rate"
+    else:
+        step = PolicyImprovement.step
+
+        def spoilt(self: Any, *arguments: Any) -> Any:
+            if kind == "advantage":
+                raise ValueError("TRPO: non-finite advantages; check rewards and value estimates")
+            found = step(self, *arguments)
+            found.report.kl = math.nan
+            return found
+
+        monkeypatch.setattr(PolicyImprovement, "step", spoilt)
+        words = "TRPO: non-finite advantages" if kind == "advantage" else "trpo/kl is nan"
+    with pytest.raises(RunDirectoryError, match=words):
+        run(tiny_recipe())
+    assert not (tmp_path / "run" / "metrics.csv").exists()
+    run(tiny_recipe("resume=true", "on_divergence=warn"))
+    assert [float(row["diverged"]) > 0 for row in rows(tmp_path / "run")] == [True, True]
+    assert words.split(";")[0].split("\\")[0] in (tmp_path / "run" / "diverged.txt").read_text()
+
+
+def test_plans_that_all_diverge_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = compose("pets/inverted_pendulum", ["run_dir=x", "model.hidden=[4]"])
+    from omegaconf import OmegaConf
+
+    algorithm: Algorithm = OmegaConf.to_object(config).build()  # type: ignore[union-attr]
+    from tensordict import TensorDict
+
+    data = TensorDict({"observation": torch.zeros(1, 3, 4)}, batch_size=[1, 3])
+    data["next", "plan", "best_return"] = torch.zeros(1, 3, 1)
+    algorithm.check_plans(data)
+    data["next", "plan", "best_return"][0, 1] = -math.inf
+    with pytest.raises(Diverged, match="in 1 of 3 steps"):
+        algorithm.check_plans(data)
+    data["observation"][0, 1] = math.nan  # then it is the state that is at fault
+    algorithm.check_plans(data)
+
+
+@pytest.mark.parametrize("name", ["trpo.max_kl", "fit.learning_rate", "policy.std", "discount"])
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf"])
+def test_settings_that_can_never_work_are_refused(
+    name: str, value: str, tiny_recipe: Recipe, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=name):
+        run(tiny_recipe(f"{name}={value}"))
+    with pytest.raises(ValueError, match="on_divergence"):
+        run(tiny_recipe("on_divergence=ignore"))
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGHUP"])
+def test_a_signal_ends_the_run_in_order(
+    name: str,
+    tiny_recipe: Recipe,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    number = getattr(signal, name)
+    complete, closed = METRPO.complete, []
+    monkeypatch.setattr("torchrl_l1.experiment.run.Tracker.close", lambda self: closed.append(self))
+
+    def complete_and_send(self: METRPO, *arguments: Any) -> Any:
+        if self.iteration == 1:
+            os.kill(os.getpid(), number)
+        return complete(self, *arguments)
+
+    monkeypatch.setattr(METRPO, "complete", complete_and_send)
+    before = signal.getsignal(number)
+    with pytest.raises(SystemExit) as exit_info, orderly_end():
+        run(tiny_recipe())
+    assert exit_info.value.code == 128 + number
+    assert capsys.readouterr().err.count(f"torchrl-l1: stopped by {name}\n") == 1
+    assert len(closed) == 1 and signal.getsignal(number) == before
+    assert len(rows(tmp_path / "run")) == 1
+
+
+def test_a_second_signal_is_not_caught() -> None:
+    seen = []
+    with pytest.raises(SystemExit), orderly_end():
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        finally:
+            seen.append(signal.getsignal(signal.SIGTERM))
+    assert seen == [signal.SIG_DFL]
+
+
+def test_a_warning_lets_the_iteration_be_finished(
+    tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = run(tiny_recipe(f"run_dir={tmp_path / 'whole'}"))
+    fit = ModelLearning.fit
+
+    def send_and_fit(self: Any, *arguments: Any) -> Any:
+        os.kill(os.getpid(), signal.SIGUSR1)
+        return fit(self, *arguments)
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as exit_info, orderly_end():
+        patch.setattr(ModelLearning, "fit", send_and_fit)
+        run(tiny_recipe())
+    assert exit_info.value.code == RESUME_ME
+    assert RunDirectory(tmp_path / "run").iterations_done() == 1
+    run(tiny_recipe("resume=true"))
+    assert (tmp_path / "run/metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()

@@ -1,0 +1,38 @@
+"""``torchrl-l1 export``: policy and L1 as one function in a file."""
+
+from __future__ import annotations
+
+import argparse
+
+from torchrl_l1.deployment import export, load_target
+from torchrl_l1.deployment.export import FORMATS
+from torchrl_l1.deployment.robustify import PRESETS
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``torchrl-l1 export``."""
+    add = parser.add_argument
+    add("target", help="a controller's folder or a run directory")
+    add("file", help=f"where to; the suffix says what: {', '.join(FORMATS)}")
+    add("--format", choices=sorted(set(FORMATS.values())), help="if the suffix does not say")
+    add("--l1", choices=PRESETS, help="what acts; the target's own by default")
+    add("--without-policy", action="store_true", help="L1 alone: the action is a second input")
+    add("--steps", type=int, default=100, help="steps on which it is compared with the original")
+    add("--seed", type=int, default=0, help="of those steps")
+
+
+def export_command(options: argparse.Namespace) -> None:
+    """``torchrl-l1 export``: the file, its inputs and outputs, and how exact it is."""
+    found = export(
+        load_target(options.target),
+        options.file,
+        format=options.format,
+        preset=options.l1,
+        with_policy=not options.without_policy,
+        steps=options.steps,
+        seed=options.seed,
+    )
+    print(f"Inputs:  {', '.join(found.inputs)}")
+    print(f"Outputs: {', '.join(found.outputs)}")
+    print(f"Largest difference in {found.steps} steps: {found.error:.3g} action units")
+    print(f"File: {found.file}")

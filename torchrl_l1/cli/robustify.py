@@ -1,0 +1,154 @@
+"""``torchrl-l1 robustify``: from a policy's file to a table, a chart and a robust controller."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import wandb
+
+from torchrl_l1.deployment import Assessment, RobustController, robustify
+from torchrl_l1.deployment.robustify import PRESETS
+from torchrl_l1.envs import DISTURBANCES, SUITES
+from torchrl_l1.experiment.run import MODES, check_wandb_mode
+from torchrl_l1.experiment.run_directory import write_atomically, write_table
+
+_PROJECT = "torchrl_l1"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``torchrl-l1 robustify``."""
+    add = parser.add_argument
+    add(
+        "env",
+        help="gymnasium/ID, PACKAGE:ID, a task of ours, dm_control/DOMAIN/TASK, or MODULE:FUNCTION "
+        "and FILE.py:FUNCTION, which return a TorchRL environment",
+    )
+    add(
+        "--policy",
+        required=True,
+        help="sb3:FILE.zip, torchscript:FILE, onnx:FILE, MODULE:NAME, FILE.py:NAME, or a run "
+        "directory",
+    )
+    add(
+        "--normalization",
+        metavar="FILE",
+        help="statistics of VecNormalize for sb3:FILE.zip, a pickle, which executes what is in it "
+        "as it is loaded; or none",
+    )
+    add("--weights", metavar="FILE", help="a state dict to load into the policy's module")
+    add("--steps", type=int, default=20_000, help="steps of the environment that are collected")
+    add("--preset", choices=PRESETS, default=PRESETS[0], help="the L1 that acts by default")
+    add("--dt", type=float, help="seconds of a step; the environment's own by default")
+    add("--epsilon", type=float, help="tolerance of the paper's switching law, state units")
+    add("--noise", type=float, default=0.3, help="exploration, fraction of half the action's range")
+    group = parser.add_argument_group(
+        "disturbances", "They vary one at a time, or as in a suite; without any, a few biases."
+    )
+    group.add_argument("--suite", choices=SUITES, help="all disturbances, each at a few values")
+    for name, entry in DISTURBANCES.items():
+        group.add_argument(f"--{name}", nargs="+", type=float, default=[], help=entry.help)
+    add("--episodes", type=int, default=10, help="episodes per cell")
+    add("--most-steps", type=int, default=1000, help="after which an episode is cut off")
+    add("--seed", type=int, default=0, help="of data, weights and resets")
+    add("--output", help="folder of the results; runs/robustify/ENV by default")
+    add("--wandb", choices=MODES, default="disabled", help="mode of Weights & Biases")
+
+
+def robustify_command(options: argparse.Namespace) -> None:
+    """``torchrl-l1 robustify``: table on the screen; CSV, PNG, Markdown and the controller."""
+    disturbances: Any = {
+        name: values for name in DISTURBANCES if (values := getattr(options, name))
+    }
+    if options.suite and disturbances:
+        raise ValueError(f"give --suite or --{next(iter(disturbances))}, not both")
+    disturbances = options.suite or disturbances
+    check_wandb_mode(options.wandb)
+    output = Path(options.output or Path("runs/robustify", _folder(options.env)))
+    if output.exists() and not output.is_dir():
+        raise ValueError(f"{output} is a file; choose another --output")
+    robust = robustify(
+        options.env,
+        options.policy,
+        options.steps,
+        preset=options.preset,
+        dt=options.dt,
+        epsilon=options.epsilon,
+        normalization=options.normalization,
+        weights=options.weights,
+        noise=options.noise,
+        seed=options.seed,
+    )
+    table = robust.evaluate(
+        disturbances or _some_biases(robust),
+        episodes=options.episodes,
+        most_steps=options.most_steps,
+        seed=options.seed,
+    )
+    print(f"\n{table.words}\n\n{table}\n")
+    folder = robust.save(output / "controller")
+    write_table(output / "evaluation.csv", table.rows)
+    write_table(output / "episodes.csv", table.episodes)
+    chart = table.plot(output / "evaluation.png")
+    usage = usage_lines(robust, folder)
+    write_atomically(output / "README.md", page(options, robust, table, usage))
+    if options.wandb != "disabled":
+        _log(options, table, chart, output)
+    print(f"Table: {output / 'evaluation.csv'}, {output / 'episodes.csv'}")
+    print(f"Chart: {chart}\nPage: {output / 'README.md'}\nController: {folder}\n")
+    print(f"To use it:\n\n{usage}")
+
+
+def _folder(env: str) -> str:
+    return "".join(letter if letter.isalnum() or letter in "._-" else "_" for letter in env)
+
+
+def _some_biases(robust: RobustController) -> dict[str, list[float]]:
+    """A sixth, a third and a half of half the range of the action."""
+    half = robust.config.half_range
+    half = max(half) if isinstance(half, tuple) else half
+    return {"bias": [round(half * share, 3) for share in (1 / 6, 1 / 3, 1 / 2)]}
+
+
+def usage_lines(robust: RobustController, folder: Path) -> str:
+    """The five lines of Python that load a controller and use it."""
+    name = robust.source.name
+    return (
+        "from torchrl_l1.deployment import RobustController, environment_source\n"
+        f"robust = RobustController.load({str(folder)!r})\n"
+        f"env = robust.wrap(environment_source({name!r}).one())\n"
+        "data = env.rollout(1000, robust.policy)\n"
+        'data["next", "l1", "u_exec"]  # what L1 sends to the actuators\n'
+    )
+
+
+def page(
+    options: argparse.Namespace, robust: RobustController, table: Assessment, usage: str
+) -> str:
+    """The page of the results, Markdown."""
+    settings = "\n".join(f"- `{name}`: `{config}`" for name, config in robust.configs.items())
+    return (
+        f"# {options.env} with L1\n\n"
+        f"Policy `{options.policy}`, {options.steps} steps of data, seed {options.seed}.\n\n"
+        f"{table.words}\n\n{table}\n\n![Returns](evaluation.png)\n\n"
+        f"## Model\n\n```text\n{robust.model.quality}\n```\n\n"
+        f"## Settings of L1\n\n{settings}\n\nBy default acts `{robust.preset}`.\n\n"
+        f"## Use\n\n```python\n{usage}```\n"
+    )
+
+
+def _log(options: argparse.Namespace, table: Assessment, chart: Path, output: Path) -> None:
+    config = {name: value for name, value in vars(options).items() if name != "command"}
+    mode = None if options.wandb == "auto" else options.wandb
+    with wandb.init(
+        mode=mode,
+        project=_PROJECT,
+        config=config,
+        dir=str(output),
+        name=f"robustify {options.env}",
+        settings=wandb.Settings(silent=True, console="off"),
+    ) as run:
+        columns = list(dict.fromkeys(key for row in table for key in row))
+        rows = [[row.get(key) for key in columns] for row in table]
+        run.log({"evaluation": wandb.Table(columns, rows), "chart": wandb.Image(str(chart))})

@@ -1,0 +1,339 @@
+"""What L1 asks of the pipeline around it: the order of transforms, the time step, its settings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
+from torchrl.data import Composite, TensorSpec
+from torchrl.envs import EnvBase, PendulumEnv, SerialEnv, TransformedEnv
+from torchrl.envs.transforms import (
+    Compose,
+    DeviceCastTransform,
+    DTypeCastTransform,
+    ExcludeTransform,
+    FrameSkipTransform,
+    SelectTransform,
+    Transform,
+)
+
+from torchrl_l1.control.config import L1Config, Scalars
+from torchrl_l1.control.jacobian import ActionJacobian, Predicts
+from torchrl_l1.control.layout import Dynamics, as_action_jacobian
+
+# Wrappers of Gymnasium that repeat an action keep the number under one of these, by custom.
+_REPEATS = ("_skip", "skip", "_frame_skip", "frame_skip", "action_repeat")
+
+_TOLERANCE = 1e-4
+
+
+def chain_of(transform: Transform) -> list[Transform]:
+    """All transforms beside this one, in order, those of nested ``Compose`` included."""
+    top = transform
+    while True:
+        reference = top.__dict__.get("_container")
+        above = None if reference is None else reference()
+        if not isinstance(above, Compose):
+            return list(_flatten(top))
+        top = above
+
+
+def _flatten(transform: Transform) -> Iterator[Transform]:
+    if isinstance(transform, Compose):
+        for member in transform:
+            yield from _flatten(member)
+    else:
+        yield transform
+
+
+def check_order(
+    l1: Transform,
+    observation_key: NestedKey,
+    action_key: NestedKey,
+    key: str,
+    names: Sequence[str],
+) -> None:
+    """Refuse transforms after L1 that must stand before it, or that take its state away.
+
+    A transform that disturbs what actuators or sensors do says so with an attribute ``disturbs``,
+    ``"action"`` or ``"observation"``, or has a method ``compensate``.
+
+    Raises:
+        ValueError: naming the transform and the right order.
+    """
+    owner = type(l1).__name__
+    chain = chain_of(l1)
+    position = next(index for index, member in enumerate(chain) if member is l1)
+    for later in chain[position + 1 :]:
+        name = type(later).__name__
+        order = f"write Compose(..., {name}(...), {owner}(...))"
+        disturbs = getattr(later, "disturbs", None)
+        if disturbs is None and callable(getattr(later, "compensate", None)):
+            disturbs = "action"
+        if isinstance(later, FrameSkipTransform) and later.frame_skip > 1:
+            raise ValueError(
+                f"{name} comes after {owner} and would apply it again to its own output: {order}, "
+                f"with the dt of {later.frame_skip} frames"
+            )
+        if disturbs == "action" and getattr(later, "key", action_key) == action_key:
+            raise ValueError(
+                f"{name} comes after {owner}, so that it disturbs the policy's action and not what "
+                f"{owner} sends to the actuators: {order}"
+            )
+        overwrites = observation_key in _written(later) or (
+            disturbs == "observation" and getattr(later, "key", None) == observation_key
+        )
+        if overwrites:
+            raise ValueError(
+                f"{name} comes after {owner} and overwrites {observation_key!r}, which L1 reads: "
+                f"put it before {owner}, {order}, give it separate out_keys, or give {owner} the "
+                "observation_key of the raw observation"
+            )
+        lost = _excluded(later, key, names)
+        if lost:
+            raise ValueError(
+                f"{name} comes after {owner} and takes away {lost} under {key!r}, which the next "
+                f"step needs: exclude them from the data instead, such as in the replay buffer"
+            )
+
+
+def _written(transform: Transform) -> list[NestedKey]:
+    # A change of type or device is none of the observation.
+    if isinstance(transform, (DTypeCastTransform, DeviceCastTransform)):
+        return []
+    return list(transform.out_keys)
+
+
+def _excluded(transform: Transform, key: str, names: Sequence[str]) -> list[str]:
+    if not isinstance(transform, ExcludeTransform):
+        return []
+    excluded = [unravel_key(one) for one in transform.excluded_keys]
+    return [name for name in names if key in excluded or (key, name) in excluded]
+
+
+def widen_selection(l1: Transform, key: str, names: Sequence[str]) -> None:
+    """Let ``key`` in a later ``SelectTransform`` stand for all that is in it, leaf by leaf."""
+    chain = chain_of(l1)
+    for later in chain[chain.index(l1) + 1 :]:
+        if isinstance(later, SelectTransform) and key in later.selected_keys:
+            leaves = [(key, name) for name in names]
+            later.selected_keys += [leaf for leaf in leaves if leaf not in later.selected_keys]
+
+
+def unspecified(l1: Transform, key: str, names: Sequence[str]) -> list[str]:
+    """Entries of the state that the environment's specs lack, so that it does not carry them on."""
+    specified = l1.container.full_observation_spec.keys(True, True)
+    return [name for name in names if (key, name) not in specified]
+
+
+def carry(
+    lacking: Sequence[str],
+    owner: str,
+    key: str,
+    tensordict: TensorDictBase,
+    following: TensorDictBase,
+) -> None:
+    """Carry entries that the specs lack from the end of a step to the start of the next.
+
+    ``SelectTransform`` keeps them, since a step reads them, but takes them from the specs.
+
+    Raises:
+        KeyError: naming them, if they are gone.
+    """
+    for name in lacking:
+        value = tensordict.get(("next", key, name), None)
+        if value is None:
+            raise KeyError(
+                f"{owner} found no {lacking} under {('next', key)} after the step: a later "
+                f"transform takes them away; keep {key!r} and all that is in it"
+            )
+        following.set((key, name), value)
+
+
+def time_step(env: EnvBase) -> float | None:
+    """Time of one step of an environment in seconds; ``None`` where it does not tell.
+
+    Read from: an attribute ``dt`` of the environment or of its ``task``, of the Gymnasium
+    environment inside, ``control_timestep`` of dm_control; times the frames that wrappers and
+    transforms skip. Environments in other processes are not asked.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> time_step(GymEnv("Pendulum-v1", frame_skip=2))
+        0.1
+    """
+    if isinstance(env, TransformedEnv):
+        inner = time_step(env.base_env)
+        for transform in _flatten(env.transform):
+            if inner is not None and isinstance(transform, FrameSkipTransform):
+                inner *= transform.frame_skip
+        return inner
+    if isinstance(env, SerialEnv):
+        members = env.__dict__.get("_envs", [])
+        found = {time_step(member) for member in members}
+        return found.pop() if len(found) == 1 else None
+    if isinstance(env, PendulumEnv):
+        return float(env.gen_params()["params", "dt"])
+    wrapped = env.__dict__.get("_env", None)
+    if wrapped is None:
+        return _told(env)
+    inner = _of_wrapped(wrapped)
+    return None if inner is None else inner * getattr(env, "wrapper_frame_skip", 1)
+
+
+def _of_wrapped(env: Any) -> float | None:
+    control_timestep = getattr(env, "control_timestep", None)
+    if callable(control_timestep):
+        return _number(control_timestep())
+    vector = getattr(env, "envs", None)
+    if isinstance(vector, (list, tuple)) and vector:
+        return _of_wrapped(vector[0])
+    frames = 1
+    while getattr(env, "env", None) is not None and hasattr(env, "unwrapped"):
+        if env is env.unwrapped:
+            break
+        skips = [env.__dict__.get(name) for name in _REPEATS]
+        frames *= next((skip for skip in skips if type(skip) is int and skip > 0), 1)
+        env = env.env
+    told = _told(env)
+    return None if told is None else told * frames
+
+
+def _told(env: Any) -> float | None:
+    try:
+        dt = getattr(env, "dt", None)
+        return _number(getattr(getattr(env, "task", None), "dt", None) if dt is None else dt)
+    except Exception:  # an environment's own attributes may fail as they like
+        return None
+
+
+def _number(value: Any) -> float | None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def check_time_step(owner: str, dt: float, env: EnvBase) -> bool:
+    """Refuse a ``dt`` that is not the environment's.
+
+    Returns:
+        whether the environment told its own.
+
+    Raises:
+        ValueError: naming both.
+    """
+    told = time_step(env)
+    if told is not None and abs(dt - told) > _TOLERANCE * told:
+        raise ValueError(
+            f"{owner} has dt={dt:.6g}, but a step of the environment takes {told:.6g} s: leave dt "
+            "out or give that, or check_dt=False if the environment is wrong"
+        )
+    return told is not None
+
+
+class Settings:
+    """What a face of L1 was told, of which an environment may add the time step.
+
+    Args:
+        owner: name of the face.
+        config: the settings, or ``None``.
+        dt: time of one environment step in seconds; the environment's if ``None``.
+        others: further fields of :class:`L1Config`'s.
+
+    Raises:
+        TypeError: for fields that it lacks.
+        ValueError: if both config and fields are given, or a setting does not fit.
+    """
+
+    def __init__(
+        self, owner: str, config: L1Config | None, dt: float | None, others: dict[str, Any]
+    ) -> None:
+        self.owner = owner
+        if config is not None:
+            given = [name for name, value in {"dt": dt, **others}.items() if value is not None]
+            if given:
+                raise ValueError(f"give config or {given}, not both; see dataclasses.replace")
+        known = {field.name for field in fields(L1Config)}
+        unknown = sorted(set(others) - known)
+        if unknown:
+            raise TypeError(f"{owner} got unknown settings {unknown}; L1Config has {sorted(known)}")
+        self._others = dict(others)
+        self.is_complete = config is not None or dt is not None
+        # Without a time step all but what depends on it is checked now.
+        self.config = config or L1Config(_SHORT if dt is None else dt, **others)
+
+    def complete(self, env: EnvBase) -> L1Config:
+        """The configuration, with the environment's time step where none was given.
+
+        Raises:
+            ValueError: if the environment does not tell.
+        """
+        if not self.is_complete:
+            dt = time_step(env)
+            if dt is None:
+                raise ValueError(self.missing)
+            self.config = L1Config(dt, **self._others)
+            self.is_complete = True
+        return self.config
+
+    def bound(self, low: Scalars | None, high: Scalars | None) -> None:
+        """Fill action bounds that are open."""
+        config = self.config
+        low = low if config.action_low is None else config.action_low
+        high = high if config.action_high is None else config.action_high
+        self.config = replace(config, action_low=low, action_high=high)
+        self._others |= {"action_low": low, "action_high": high}
+
+    @property
+    def missing(self) -> str:
+        """What to say where the time step is not known."""
+        return (
+            f"{self.owner} needs dt, the time of one environment step in seconds: the environment "
+            "does not tell it"
+        )
+
+
+_SHORT = 1e-6
+
+
+def as_model(
+    dynamics: Dynamics,
+    observation_key: NestedKey,
+    action_key: NestedKey,
+    predicts: Predicts | None,
+    out_key: NestedKey | None,
+    ensemble_dim: int | None,
+) -> ActionJacobian:
+    """The dynamics as an :class:`ActionJacobian`, which is returned as it is."""
+    if out_key is None and ensemble_dim is None:
+        return as_action_jacobian(dynamics, observation_key, action_key, predicts)
+    if isinstance(dynamics, ActionJacobian):
+        raise ValueError("out_key and ensemble_dim belong to the ActionJacobian: give them there")
+    return ActionJacobian(
+        dynamics,
+        observation_key=observation_key,
+        action_key=action_key,
+        out_key=out_key,
+        predicts=predicts,
+        ensemble_dim=ensemble_dim,
+    )
+
+
+def leaf_spec(spec: TensorSpec) -> TensorSpec:
+    """The spec itself, or the only leaf of a composite one.
+
+    Raises:
+        ValueError: if it has several.
+    """
+    if not isinstance(spec, Composite):
+        return spec
+    leaves = list(spec.keys(include_nested=True, leaves_only=True))
+    if len(leaves) != 1:
+        raise ValueError(f"action_spec has several entries {leaves}: give that of the action")
+    return spec[leaves[0]]

@@ -1,0 +1,370 @@
+"""Environments by name, or by a function that makes them, ready for a policy with L1."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import gymnasium
+import mujoco
+import torch
+from torchrl.data import Bounded, TensorSpec, Unbounded
+from torchrl.envs import (
+    CatTensors,
+    Compose,
+    DMControlEnv,
+    DoubleToFloat,
+    EnvBase,
+    FrameSkipTransform,
+    GymEnv,
+    SerialEnv,
+    Transform,
+    TransformedEnv,
+    UnsqueezeTransform,
+)
+
+from torchrl_l1.envs import (
+    DISTURBANCES,
+    TASKS,
+    BatchedMujocoEnv,
+    Disturbance,
+    Task,
+    disturbance_transforms,
+    disturbed_model,
+    get_task,
+    make_env,
+)
+
+MakeEnv = str | Task | Callable[[], EnvBase]
+"""A name, a task of ours, or a function that makes an environment."""
+
+_FORMS = (
+    "gymnasium/ID (gymnasium/Pendulum-v1), a task of ours "
+    f"({', '.join(TASKS)}), PACKAGE:ID, dm_control/DOMAIN/TASK, or MODULE:FUNCTION and "
+    "FILE.py:FUNCTION, which return a TorchRL environment"
+)
+
+
+@dataclass(frozen=True)
+class EnvironmentSource:
+    """Makes the same environment as often as it is asked to.
+
+    Attributes:
+        name: by which :func:`environment_source` finds it again; empty for a function.
+        build: makes one environment, as its library has it.
+        task: where it is a task of ours.
+        renders: whether ``build`` takes Gymnasium's ``render_mode``.
+    """
+
+    name: str
+    build: Callable[..., EnvBase]
+    task: Task | None = None
+    renders: bool = False
+
+    def one(self) -> EnvBase:
+        """One environment with a vector ``observation`` and a vector ``action``, both float32."""
+        return vector_environment(self.build())
+
+    def several(
+        self,
+        count: int,
+        disturbances: Mapping[str, float] | None = None,
+        control: Sequence[Transform] = (),
+        seed: int | None = None,
+    ) -> TransformedEnv:
+        """So many environments at once, disturbed, with what controls them.
+
+        Args:
+            count: how many; an environment that is a batch already keeps its own number.
+            disturbances: by name, see :data:`~torchrl_l1.envs.DISTURBANCES`.
+            control: transforms that come last, such as an ``L1Transform``.
+            seed: of the resets.
+
+        Raises:
+            ValueError: for a disturbance that cannot act on it.
+        """
+        given = self._checked(disturbances or {})
+        if self.task is not None:
+            return make_env(self.task, count, extra_transforms=control, seed=seed, **given)
+        first = self._changed(given)
+        base = first if first.batch_size else SerialEnv(count, lambda: self._changed(given))
+        return _perturbed(base, given, control, seed)
+
+    def single(
+        self,
+        disturbances: Mapping[str, float] | None = None,
+        control: Sequence[Transform] = (),
+        seed: int | None = None,
+        **options: Any,
+    ) -> TransformedEnv:
+        """As :meth:`several`, one by itself, which a task of ours has as a batch of one.
+
+        Args:
+            disturbances: as there.
+            control: as there.
+            seed: as there.
+            **options: of what makes it, such as ``render_mode`` where it :attr:`renders`.
+        """
+        given = self._checked(disturbances or {})
+        if self.task is not None:
+            return make_env(self.task, 1, extra_transforms=control, seed=seed, **given)
+        return _perturbed(self._changed(given, **options), given, control, seed)
+
+    def _checked(self, disturbances: Mapping[str, float]) -> dict[str, float]:
+        for name in disturbances:
+            if not self.takes(DISTURBANCES[name]):
+                raise ValueError(
+                    f"{name} changes the plant, which needs a task of ours or one of Gymnasium's "
+                    f"MuJoCo environments, not {self.name or 'a function'}: leave it out"
+                )
+        return dict(disturbances)
+
+    def _changed(self, disturbances: Mapping[str, float], **options: Any) -> EnvBase:
+        env = vector_environment(self.build(**options))
+        plant = {name: v for name, v in disturbances.items() if _of_plant(DISTURBANCES[name])}
+        if plant:
+            simulation = simulation_of(env)
+            simulation.model = disturbed_model(simulation.model, plant)
+        return env
+
+    def takes(self, disturbance: Disturbance) -> bool:
+        """Whether a disturbance can act on it."""
+        if not _of_plant(disturbance) or self.task is not None:
+            return True
+        # The force of a wind does not survive Gymnasium's resets.
+        return disturbance.name != "wind" and simulation_of(self.build()) is not None
+
+    def time_step(self) -> float | None:
+        """Time of one environment step in seconds, as far as the environment tells."""
+        return self.task.dt if self.task is not None else time_step(self.build())
+
+
+def _perturbed(
+    base: EnvBase,
+    disturbances: Mapping[str, float],
+    control: Sequence[Transform],
+    seed: int | None,
+) -> TransformedEnv:
+    given = {name: v for name, v in disturbances.items() if not _of_plant(DISTURBANCES[name])}
+    chain = Compose(*disturbance_transforms(**given), *control)
+    env = TransformedEnv(base, chain, auto_unwrap=True)
+    if seed is not None:
+        env.set_seed(seed % 2**31)
+    return env
+
+
+def _of_plant(disturbance: Disturbance) -> bool:
+    return disturbance.acts_on == "plant"
+
+
+def environment_source(env: MakeEnv) -> EnvironmentSource:
+    """What makes an environment, from its name or a function.
+
+    Args:
+        env: ``gymnasium/ID``, a task of ours, ``PACKAGE:ID`` of a package that registers with
+            Gymnasium, ``dm_control/DOMAIN/TASK``, or ``MODULE:FUNCTION`` and ``FILE.py:FUNCTION``
+            of a function without arguments that returns a TorchRL environment; or such a function
+            itself.
+
+    Raises:
+        TypeError: for an environment in place of a function that makes it.
+        ValueError: for a name that stands for nothing.
+
+    Examples:
+        >>> environment_source("gymnasium/Pendulum-v1").time_step()
+        0.05
+        >>> environment_source("half_cheetah").time_step()
+        0.05
+    """
+    if isinstance(env, EnvBase):
+        raise TypeError(
+            f"got a {type(env).__name__}: give a function that makes it, such as "
+            "lambda: GymEnv('Pendulum-v1'), since several are needed"
+        )
+    if isinstance(env, Task):
+        return _of_task(env.name, env)
+    if not isinstance(env, str):
+        return EnvironmentSource("", env)
+    if env in TASKS:
+        return _of_task(env, get_task(env))
+    first, _, rest = env.partition("/")
+    if first == "gymnasium" and rest:
+        return _of_gymnasium(env, rest)
+    if first == "dm_control":
+        return _of_dm_control(env, rest)
+    module, _, name = env.partition(":")
+    if name.isidentifier() and (found := _attribute(module, name)) is not None:
+        return EnvironmentSource(env, found)
+    if name or env in gymnasium.registry:
+        return _of_gymnasium(env, env)
+    raise ValueError(f"unknown environment {env!r}; names are {_FORMS}")
+
+
+def _of_task(name: str, task: Task) -> EnvironmentSource:
+    return EnvironmentSource(name, partial(BatchedMujocoEnv, task, 1), task)
+
+
+def _of_gymnasium(name: str, gymnasium_id: str) -> EnvironmentSource:
+    package, colon, rest = gymnasium_id.partition(":")
+    try:
+        if colon:  # of a package that registers it
+            import_module(package)
+        plain = rest if colon else gymnasium_id
+        gymnasium.spec(plain)
+    except (gymnasium.error.Error, ImportError) as error:
+        raise ValueError(f"{name}: {error}; names are {_FORMS}") from None
+    return EnvironmentSource(name, partial(GymEnv, plain), renders=True)
+
+
+def _of_dm_control(name: str, rest: str) -> EnvironmentSource:
+    domain, _, task = rest.partition("/")
+    if not task:
+        raise ValueError(
+            f"{name}: write dm_control/DOMAIN/TASK, such as dm_control/cartpole/balance"
+        )
+    require("dm_control", "dm_control")
+    return EnvironmentSource(name, partial(DMControlEnv, domain, task))
+
+
+def require(module: str, extra: str) -> ModuleType:
+    """Import a package that is not needed by all.
+
+    Raises:
+        ValueError: if it is not there, with the extra that brings it.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise ValueError(
+            f"{module} cannot be imported ({error}): pip install 'torchrl-l1[{extra}]'"
+        ) from None
+
+
+def load_attribute(name: str) -> Any:
+    """What ``MODULE:NAME`` or ``FILE.py:NAME`` names.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    module, _, attribute = name.partition(":")
+    found = _attribute(module, attribute)
+    if found is None:
+        raise ValueError(f"{module} has no {attribute!r}")
+    return found
+
+
+def _attribute(module: str, name: str) -> Any:
+    return getattr(_module(module), name, None)
+
+
+def _module(name: str) -> ModuleType:
+    if not name.endswith(".py"):
+        try:
+            return import_module(name)
+        except ModuleNotFoundError as error:
+            raise ValueError(f"there is no module {name!r} ({error})") from None
+    file = Path(name).resolve()
+    if not file.exists():
+        raise ValueError(f"there is no file {name}")
+    spec = importlib.util.spec_from_file_location(file.stem, file)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    # As of an import: what the file defines may look its own module up.
+    sys.modules.setdefault(file.stem, module)
+    spec.loader.exec_module(module)
+    return module
+
+
+def vector_environment(env: EnvBase) -> EnvBase:
+    """An environment with a vector ``observation`` and a vector ``action``, both float32.
+
+    Where the observation comes in parts, as dm_control's does, they are joined in the order of
+    their names.
+
+    Raises:
+        ValueError: if it has no such observation or action.
+    """
+    actions = list(env.full_action_spec.keys(True, True))
+    action = env.full_action_spec["action"] if actions == ["action"] else None
+    continuous = isinstance(action, (Bounded, Unbounded)) and action.dtype.is_floating_point
+    if action is None or not continuous or action.ndim != len(env.batch_size) + 1:
+        raise ValueError(
+            f"L1 needs one vector of continuous actions under 'action'; {type(env).__name__} has "
+            f"{env.full_action_spec}"
+        )
+    transforms: list[Transform] = []
+    found = _vectors(env)
+    if "observation" in found:
+        found = {"observation": found["observation"]}
+    elif found:
+        scalars = [key for key, spec in found.items() if spec.ndim == len(env.batch_size)]
+        if scalars:
+            transforms.append(UnsqueezeTransform(-1, in_keys=scalars, out_keys=scalars))
+        transforms.append(CatTensors(sorted(found), "observation", del_keys=False))
+    else:
+        raise ValueError(
+            f"{type(env).__name__} has no vector of floating-point observations, only "
+            f"{sorted(map(str, env.full_observation_spec.keys(True, True)))}"
+        )
+    double = {
+        "in_keys": ["observation"] * any(s.dtype == torch.float64 for s in found.values()),
+        "in_keys_inv": ["action"] * (action.dtype == torch.float64),
+    }
+    if any(double.values()):
+        transforms.append(DoubleToFloat(**double))
+    return TransformedEnv(env, Compose(*transforms), auto_unwrap=True) if transforms else env
+
+
+def _vectors(env: EnvBase) -> dict[str, TensorSpec]:
+    """Floating-point observations that are vectors, or numbers, and not nested."""
+    dims = len(env.batch_size)
+    return {
+        key: spec
+        for key, spec in env.full_observation_spec.items(True, True)
+        if isinstance(key, str) and spec.dtype.is_floating_point and spec.ndim - dims <= 1
+    }
+
+
+def time_step(env: EnvBase) -> float | None:
+    """Time of one environment step in seconds; ``None`` where the environment does not tell.
+
+    Asked are Gymnasium's ``dt``, dm_control's ``control_timestep`` and the tasks here; frames that
+    are skipped count.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> time_step(GymEnv("Pendulum-v1", frame_skip=2))
+        0.1
+    """
+    frames = 1
+    while isinstance(env, TransformedEnv):
+        for transform in env.transform.modules():
+            if isinstance(transform, FrameSkipTransform):
+                frames *= transform.frame_skip
+        env = env.base_env
+    if isinstance(env, BatchedMujocoEnv):
+        return frames * env.task.dt
+    inner = getattr(env, "_env", None)
+    if inner is None:
+        return None
+    frames *= getattr(env, "wrapper_frame_skip", 1)
+    control = getattr(inner, "control_timestep", None)
+    if callable(control):
+        return frames * float(control())
+    dt = getattr(getattr(inner, "unwrapped", None), "dt", None)
+    return frames * float(dt) if isinstance(dt, (int, float)) and dt > 0 else None
+
+
+def simulation_of(env: EnvBase) -> Any:
+    """Gymnasium's environment with MuJoCo's ``model`` and ``data``, if it is one; else ``None``."""
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    inner = getattr(getattr(env, "_env", None), "unwrapped", None)
+    return inner if isinstance(getattr(inner, "model", None), mujoco.MjModel) else None

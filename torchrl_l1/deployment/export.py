@@ -1,0 +1,342 @@
+"""Policy and L1 as one function with its state in the open, for machines without TorchRL."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_l1.checks import check_choice, check_count
+from torchrl_l1.control import ActionJacobian, L1Config, L1State, L1Transform, augment, init
+from torchrl_l1.deployment.assessment import run_episodes
+from torchrl_l1.deployment.environments import require
+from torchrl_l1.deployment.policies import FunctionPolicy
+from torchrl_l1.deployment.robustify import RobustController
+from torchrl_l1.dynamics import EnsembleDynamics
+
+FORMATS = {".pt": "torchscript", ".ts": "torchscript", ".onnx": "onnx", ".pt2": "export"}
+"""What a file holds, by its suffix."""
+
+_aten = torch.ops.aten
+
+Step = Callable[..., Sequence[Tensor]]
+
+
+class ControlledStep(nn.Module):
+    """One step of policy and L1: observation and state to the executed input and the next state.
+
+    Args:
+        policy: the policy; without one, its action is an input beside the observation.
+        model: the learned dynamics.
+        config: settings of L1, bounds of the action included.
+    """
+
+    def __init__(
+        self,
+        policy: TensorDictModuleBase | None,
+        model: EnsembleDynamics,
+        config: L1Config,
+    ) -> None:
+        super().__init__()
+        self.policy, self.config = policy, config
+        # Its weights become constants: torch.export cannot slice the lists of a module's own.
+        self.jacobian = ActionJacobian(copy.deepcopy(model).requires_grad_(False))
+        fresh = init([1], model.observation_dim, model.action_dim, config)
+        self.fresh = fresh.entries()
+
+    def forward(self, observation: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """The executed input ``(1, m)`` and the next state, in the order of :attr:`fresh`.
+
+        Args:
+            observation: ``(1, n)``.
+            inputs: the policy's action ``(1, m)`` if there is no policy, then the state.
+        """
+        if self.policy is None:
+            action, *entries = inputs
+        else:
+            action, entries = self._act(observation), list(inputs)
+        state = L1State(**dict(zip(self.fresh, entries, strict=True)))
+        executed, following, _ = augment(self.config, self.jacobian, state, observation, action)
+        return executed, *following.entries().values()
+
+    def _act(self, observation: Tensor) -> Tensor:
+        if isinstance(self.policy, FunctionPolicy):
+            return self.policy.act(observation)
+        data = TensorDict({"observation": observation}, batch_size=[1])
+        assert self.policy is not None
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            return self.policy(data).get("action")
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written.
+
+    Attributes:
+        file: where it is.
+        inputs: names of the inputs; all have a batch dimension of one.
+        outputs: names of the outputs.
+        error: largest difference of the executed input on recorded steps, action units.
+        steps: how many steps that were.
+    """
+
+    file: Path
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    error: float
+    steps: int
+
+
+def export(
+    robust: RobustController,
+    file: str | Path,
+    *,
+    format: str | None = None,
+    preset: str | None = None,
+    with_policy: bool = True,
+    steps: int = 100,
+    tolerance: float = 1e-4,
+    seed: int = 0,
+) -> Exported:
+    """Write a policy with L1 as one function, and compare it with the original.
+
+    Inputs are ``observation (1, n)`` and the entries of :class:`~torchrl_l1.control.L1State` that
+    the settings need, outputs ``action (1, m)`` and the same entries for the next step, by the
+    same names with ``next_`` before them. An episode begins with zeros (``started`` false), as
+    :func:`~torchrl_l1.control.init` makes them. All is float32 but ``n_switch`` (int64) and
+    ``started`` (bool).
+
+    Args:
+        robust: what is written.
+        file: ``.pt`` or ``.ts`` for TorchScript, ``.onnx``, or ``.pt2`` for a program of
+            ``torch.export``.
+        format: ``"torchscript"``, ``"onnx"`` or ``"export"``, if the suffix does not say.
+        preset: settings of L1; those that act by default if ``None``.
+        with_policy: without it, the policy's action is a second input ``u_rl (1, m)``.
+        steps: of the environment, on which it is compared.
+        tolerance: largest difference allowed, as a fraction of half the range of the action.
+        seed: of those steps.
+
+    Returns:
+        names of inputs and outputs, and the largest difference.
+
+    Raises:
+        ValueError: for another format, a policy that is not made of torch's operations, or a
+            difference above the tolerance.
+    """
+    file = Path(file)
+    format = FORMATS.get(file.suffix, "") if format is None else format
+    check_choice("format", format or file.suffix, ("torchscript", "onnx", "export"))
+    check_count("steps", steps)
+    if format == "onnx":
+        for name in ("onnx", "onnxscript", "onnxruntime"):
+            require(name, "onnx")
+    config, recorded = _recorded(robust, preset, steps, seed)
+    policy = robust.policy if with_policy else None
+    module = ControlledStep(policy, robust.model, config).eval()
+    names = list(module.fresh)
+    inputs = ("observation", *([] if with_policy else ["u_rl"]), *names)
+    outputs = ("action", *(f"next_{name}" for name in names))
+    first = recorded["observation"][:1]
+    given = () if with_policy else (recorded["action"][:1],)
+    example = (first, *given, *module.fresh.values())
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with torch.no_grad(), _quiet():
+        try:
+            step = _WRITERS[format](module, example, file, inputs, outputs)
+        except Exception as error:  # of the tracers, anything
+            if with_policy and not _is_torch(robust.policy, first):
+                raise ValueError(
+                    "the policy cannot be exported, since it is not made of torch's operations: "
+                    "export L1 alone (with_policy=False, --without-policy)"
+                ) from error
+            raise
+        error = _compare(step, recorded, module, with_policy)
+    half = config.half_range
+    allowed = tolerance * (min(half) if isinstance(half, tuple) else half)
+    if not error <= allowed:
+        raise ValueError(
+            f"{file} differs from the original by up to {error:.3g} action units in {steps} steps, "
+            f"and {allowed:.3g} are allowed: a policy that draws random numbers, or that is not "
+            "made of torch's operations, cannot be exported (see with_policy, --without-policy)"
+        )
+    return Exported(file, inputs, outputs, error, steps)
+
+
+def _recorded(
+    robust: RobustController, preset: str | None, steps: int, seed: int
+) -> tuple[L1Config, TensorDictBase]:
+    """The settings with the environment's bounds, and steps ``[T]`` of one episode."""
+    transform = L1Transform(robust.model, robust.configs[preset or robust.preset])
+    with torch.random.fork_rng(devices=[]):
+        data = run_episodes(robust.source, robust.policy, {}, [transform], 1, steps, seed)
+    spec = vector_bounds(robust)
+    return replace(transform.config, **spec), data.reshape(-1)[:steps]
+
+
+def vector_bounds(robust: RobustController) -> dict[str, Any]:
+    """Bounds of the action that the settings leave open, from the environment."""
+    space = getattr(robust.source.one().full_action_spec["action"], "space", None)
+    found = {}
+    for name, side in (("action_low", "low"), ("action_high", "high")):
+        bound = getattr(space, side, None)
+        if getattr(robust.config, name) is None and bound is not None:
+            found[name] = tuple(bound.reshape(-1).tolist())
+    return found
+
+
+def _is_torch(policy: TensorDictModuleBase, observation: Tensor) -> bool:
+    """Whether a policy's action carries the derivative of its observation."""
+    if not isinstance(policy, FunctionPolicy):
+        return True
+    try:
+        with torch.enable_grad():
+            return policy.act(observation.clone().requires_grad_()).requires_grad
+    except Exception:  # such as a call of numpy() on what needs a gradient
+        return False
+
+
+def _compare(
+    step: Step, recorded: TensorDictBase, module: ControlledStep, with_policy: bool
+) -> float:
+    """Largest difference of executed inputs along recorded steps."""
+    state: Sequence[Tensor] = list(module.fresh.values())
+    worst = 0.0
+    for row in recorded:
+        given = () if with_policy else (row["action"][None],)
+        executed, *state = step(row["observation"][None], *given, *state)
+        difference = executed[0] - row["next", "l1", "u_exec"]
+        worst = max(worst, float(difference.abs().max()))
+        # A difference that is not a number must not look like none.
+        worst = worst if bool(difference.isfinite().all()) else float("inf")
+    return worst
+
+
+def _torchscript(
+    module: ControlledStep, example: tuple[Tensor, ...], file: Path, *_: object
+) -> Step:
+    traced = torch.jit.freeze(torch.jit.trace(module, example, check_trace=False).eval())
+    torch.jit.save(traced, str(file))
+    return torch.jit.load(str(file))
+
+
+def _program(module: ControlledStep, example: tuple[Tensor, ...], file: Path, *_: object) -> Step:
+    torch.export.save(torch.export.export(module, example), str(file))
+    return torch.export.load(str(file)).module()
+
+
+def _onnx(
+    module: ControlledStep,
+    example: tuple[Tensor, ...],
+    file: Path,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+) -> Step:
+    program = torch.export.export(module, example).run_decompositions(_UNROLLED)
+    torch.onnx.export(
+        program, example, str(file), dynamo=True, verbose=False, external_data=False,
+        input_names=list(inputs), output_names=list(outputs),
+    )  # fmt: skip
+    runtime = require("onnxruntime", "onnx")
+    session = runtime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    # What does not matter to any output is no input of the graph.
+    known = {one.name for one in session.get_inputs()}
+
+    def step(*values: Tensor) -> list[Tensor]:
+        named = zip(inputs, values, strict=True)
+        given = {name: value.numpy() for name, value in named if name in known}
+        return [torch.as_tensor(value) for value in session.run(None, given)]
+
+    return step
+
+
+_WRITERS: dict[str, Callable[..., Step]] = {
+    "torchscript": _torchscript,
+    "export": _program,
+    "onnx": _onnx,
+}
+
+
+@contextmanager
+def _quiet() -> Any:
+    """Without what the exporters say of themselves."""
+    logger = logging.getLogger("torch.onnx")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(before)
+
+
+# ONNX has no triangular factors or solutions: for the few rows of a state they are unrolled.
+
+
+def cholesky(matrix: Tensor, *_: object, **__: object) -> tuple[Tensor, Tensor]:
+    """``torch.linalg.cholesky_ex`` in elementary operations.
+
+    Examples:
+        >>> matrix = torch.tensor([[4.0, 2.0], [2.0, 5.0]])
+        >>> cholesky(matrix)[0]
+        tensor([[2., 0.],
+                [1., 2.]])
+    """
+    columns: list[Tensor] = []
+    for j in range(matrix.shape[-1]):
+        column = matrix[..., j:, j]
+        for known in columns:
+            column = column - known[..., j:] * known[..., j : j + 1]
+        column = column / column[..., :1].sqrt()
+        columns.append(torch.cat([torch.zeros_like(matrix[..., :j, j]), column], -1))
+    factor = torch.stack(columns, -1)
+    diagonal = torch.stack([known[..., j] for j, known in enumerate(columns)], -1)
+    failed = ~(diagonal > 0).all(-1)
+    return factor, failed.to(torch.int32)
+
+
+def solve_triangular(
+    matrix: Tensor, right: Tensor, *, upper: bool, left: bool = True, unitriangular: bool = False
+) -> Tensor:
+    """``torch.linalg.solve_triangular`` from the left in elementary operations.
+
+    Examples:
+        >>> matrix = torch.tensor([[2.0, 0.0], [1.0, 2.0]])
+        >>> solve_triangular(matrix, torch.tensor([[2.0], [5.0]]), upper=False).squeeze(-1)
+        tensor([1., 2.])
+    """
+    assert left and not unitriangular
+    size = matrix.shape[-1]
+    rows: dict[int, Tensor] = {}
+    for i in reversed(range(size)) if upper else range(size):
+        row = right[..., i, :]
+        for k, known in rows.items():
+            row = row - matrix[..., i, k, None] * known
+        rows[i] = row / matrix[..., i, i, None]
+    return torch.stack([rows[i] for i in range(size)], -2)
+
+
+def cholesky_solve(right: Tensor, factor: Tensor, upper: bool = False) -> Tensor:
+    """``torch.cholesky_solve`` of a lower factor in elementary operations."""
+    assert not upper
+    lower = solve_triangular(factor, right, upper=False)
+    return solve_triangular(factor.mT, lower, upper=True)
+
+
+_UNROLLED: dict[Any, Callable[..., Any]] = {
+    _aten.linalg_cholesky_ex.default: cholesky,
+    _aten.linalg_solve_triangular.default: solve_triangular,
+    _aten.cholesky_solve.default: cholesky_solve,
+}

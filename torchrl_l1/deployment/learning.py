@@ -1,0 +1,202 @@
+"""From a policy to a model: what is collected, what is fitted, and how switching is tuned."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.data import Bounded, TensorSpec
+from torchrl.envs import Transform
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_l1.algorithms.collection import seed_streams, stream_seed
+from torchrl_l1.deployment.environments import EnvironmentSource
+from torchrl_l1.dynamics import EnsembleDynamics
+
+FEW_OBSERVATIONS = 5
+"""Below this width of the observation, the paper's rule of thumb allows few switches."""
+
+_MEAN_HOLD = 10
+
+
+class Exploration(TensorDictModuleBase):
+    r"""A policy with noise on its action, for data that a model can be fitted to.
+
+    Half of the noise is held for a number of steps that is drawn anew each time, ten in the mean:
+    the model must know what an action does that is off for a while, as under a disturbance. The
+    other half is new in every step. The level of both is drawn with the held part, between none and
+    twice ``noise``, so that some data are those of the policy itself. Actions stay within their
+    bounds.
+
+    Args:
+        policy: the policy.
+        action: spec of the action, for all environments.
+        noise: standard deviation as a fraction of half the range of the action, or in action units
+            where it has no bounds.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase, action: TensorSpec, noise: float) -> None:
+        super().__init__()
+        self.policy = policy
+        self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
+        bounds = action.space if isinstance(action, Bounded) else None
+        self.low = None if bounds is None else bounds.low
+        self.high = None if bounds is None else bounds.high
+        zero = action.zero()
+        half = torch.ones_like(zero)
+        if self.low is not None and self.high is not None:
+            range_ = self.high - self.low
+            half = torch.where(range_.isfinite(), 0.5 * range_, 1.0)
+        self.scale = noise * half
+        self.held = torch.randn_like(zero)
+        self.level = 2 * torch.rand_like(zero[..., :1])
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the policy's action with noise."""
+        tensordict = self.policy(tensordict)
+        renewed = torch.rand_like(self.level) < 1 / _MEAN_HOLD
+        self.held = torch.where(renewed, torch.randn_like(self.held), self.held)
+        self.level = torch.where(renewed, 2 * torch.rand_like(self.level), self.level)
+        noise = 0.5**0.5 * self.level * (self.held + torch.randn_like(self.held))
+        action = tensordict.get("action") + self.scale * noise
+        if self.low is not None:
+            action = action.clamp(self.low, self.high)
+        return tensordict.set("action", action)
+
+
+def policy_transforms(policy: TensorDictModuleBase) -> list[Transform]:
+    """What an environment needs for a policy with a memory."""
+    primer = getattr(policy, "make_tensordict_primer", None)
+    return [] if primer is None else [primer()]
+
+
+def collect(
+    source: EnvironmentSource,
+    policy: TensorDictModuleBase,
+    steps: int,
+    environments: int,
+    noise: float,
+    seed: int,
+    on_step: Callable[[int], object] | None = None,
+) -> TensorDictBase:
+    """Undisturbed steps of a policy with exploration noise.
+
+    Args:
+        source: makes the environments.
+        policy: the policy.
+        steps: how many at least, of all environments together.
+        environments: how many at once.
+        noise: see :class:`Exploration`.
+        seed: of resets and noise.
+        on_step: called with the number of new steps, for progress bars.
+
+    Returns:
+        ``[environments, T]``; episodes follow each other in a row.
+    """
+    env = source.several(environments, control=policy_transforms(policy))
+    env.set_seed(stream_seed(seed, "collect") % 2**31)
+    seed_streams(seed, "collect")
+    rows = env.batch_size.numel()
+    exploring = Exploration(policy, env.full_action_spec["action"], noise)
+
+    def progress(*_: object) -> None:
+        if on_step is not None:
+            on_step(rows)
+
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        data = env.rollout(
+            -(-steps // rows), exploring, callback=progress, break_when_any_done=False
+        )
+    env.close()
+    return data
+
+
+def target_switch_rate(observation_dim: int) -> float:
+    """Switches per 1000 steps in the middle of the paper's rule of thumb.
+
+    It asks for 0 to 100 where the observation has fewer than five entries, and for 200 to 500
+    where it has more (arXiv 2403.14860, appendix).
+
+    Examples:
+        >>> target_switch_rate(4), target_switch_rate(17)
+        (50.0, 350.0)
+    """
+    return 50.0 if observation_dim < FEW_OBSERVATIONS else 350.0
+
+
+@torch.no_grad()
+def switch_rates(
+    model: EnsembleDynamics, observation: Tensor, action: Tensor, started: Tensor, epsilon: Tensor
+) -> Tensor:
+    """Switches per 1000 steps that the switching law would make along recorded steps.
+
+    Args:
+        model: the learned dynamics.
+        observation: ``(N, T, n)``.
+        action: ``(N, T, m)``, at which the affine model is tested.
+        started: ``(N, T)`` bool, false where an episode begins.
+        epsilon: tolerances ``(K,)``, state units.
+
+    Returns:
+        ``(K,)``.
+
+    Examples:
+        >>> _ = torch.manual_seed(0)
+        >>> model = EnsembleDynamics(2, 1, hidden=(8,))
+        >>> x, u = torch.randn(1, 50, 2), torch.randn(1, 50, 1)
+        >>> started = torch.ones(1, 50, dtype=torch.bool)
+        >>> rates = switch_rates(model, x, u, started, torch.tensor([0.0, 1e9]))
+        >>> bool(rates[0] > 900), float(rates[1])
+        (True, 0.0)
+    """
+    rows, count = observation.shape[0], len(epsilon)
+    u_bar = action[:, 0].expand(count, *action[:, 0].shape)
+    switches = torch.zeros(count, dtype=torch.float64)
+    for step in range(observation.shape[1]):
+        x = observation[:, step].expand(count, rows, -1)
+        u = action[:, step].expand(count, rows, -1)
+        u_bar = torch.where(started[:, step, None], u_bar, u)
+        error = torch.linalg.vector_norm(model.taylor_remainder(x, u_bar, u), dim=-1)
+        switch = (error > epsilon[:, None]) & started[:, step]
+        u_bar = torch.where(switch[..., None], u, u_bar)
+        switches += switch.sum(1)
+    return 1000 * switches / max(1, int(started.sum()))
+
+
+def epsilon_for(
+    model: EnsembleDynamics, data: TensorDictBase, rate: float, most_steps: int = 2000
+) -> tuple[float, float]:
+    """The tolerance with which the operating point switches at a rate along recorded steps.
+
+    The interval that holds it is divided again and again, sixteen tolerances at a time: rates fall
+    with the tolerance.
+
+    Args:
+        model: the learned dynamics.
+        data: undisturbed steps ``[N, T]``.
+        rate: switches per 1000 steps.
+        most_steps: how many steps are looked at.
+
+    Returns:
+        epsilon in state units, and the rate found with it.
+    """
+    length = max(2, min(data.shape[1], most_steps // data.shape[0]))
+    part = data[:, :length]
+    observation, action = part["observation"].float(), part["action"].float()
+    done = part["next", "done"].squeeze(-1)
+    started = torch.cat([torch.zeros_like(done[:, :1]), ~done[:, :-1]], 1)
+    scale = torch.linalg.vector_norm(model.change_normalizer.std).item()
+    low, high = 1e-6 * scale, 1e2 * scale
+    for _ in range(3):
+        epsilon = torch.logspace(*torch.tensor([low, high]).log10().tolist(), 16)
+        rates = switch_rates(model, observation, action, started, epsilon)
+        above = int((rates > rate).sum())  # they fall
+        low = float(epsilon[max(above - 1, 0)])
+        high = float(epsilon[min(above, 15)])
+        if high <= low:
+            break
+    best = int((rates - rate).abs().argmin())
+    return float(epsilon[best]), float(rates[best])

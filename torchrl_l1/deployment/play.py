@@ -1,0 +1,242 @@
+"""Episodes as films: of a policy, with L1 off or on, one or several side by side."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from matplotlib import pyplot
+from matplotlib.animation import FuncAnimation
+from PIL import Image, ImageDraw
+from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_l1.algorithms.collection import seed_streams, stream_seed
+from torchrl_l1.control import L1Transform
+from torchrl_l1.deployment.environments import require, simulation_of
+from torchrl_l1.deployment.learning import policy_transforms
+from torchrl_l1.deployment.robustify import RobustController
+from torchrl_l1.envs.rendering import draw_poses, rollout_frames
+from torchrl_l1.experiment.l1_options import OFF
+
+SUFFIXES = (".mp4", ".gif")
+"""Films that :func:`write_film` can write."""
+
+
+@dataclass(frozen=True)
+class Film:
+    """An episode in pictures.
+
+    Attributes:
+        label: what is written on it.
+        frames: RGB images ``(height, width, 3)``, uint8, one for each step.
+        total: the undiscounted return.
+        ended: whether the episode terminated, as in a fall.
+    """
+
+    label: str
+    frames: Sequence[np.ndarray]
+    total: float
+    ended: bool
+
+
+def film(
+    robust: RobustController,
+    l1: str,
+    disturbances: Mapping[str, float],
+    *,
+    steps: int = 500,
+    seed: int = 0,
+    size: tuple[int, int] = (480, 360),
+) -> Film:
+    """Record an episode.
+
+    MuJoCo's environments are drawn off screen in a process of their own, others by their
+    ``render``.
+
+    Args:
+        robust: policy, model and environment.
+        l1: ``"off"`` or one of the presets.
+        disturbances: values by name.
+        steps: after which the episode is cut off.
+        seed: of reset and disturbances.
+        size: width and height in pixels, of MuJoCo's environments.
+
+    Raises:
+        RenderingUnavailable: if MuJoCo cannot draw here.
+        ValueError: for an environment that cannot be drawn, or an unknown preset.
+    """
+    source = robust.source
+    control: list[Transform] = policy_transforms(robust.policy)
+    if l1 != OFF:
+        control.append(L1Transform(robust.model, robust.settings(l1)))
+    mujoco_ = source.task is not None or _physics(source.one()) is not None
+    if not mujoco_ and not source.renders:
+        raise ValueError(
+            f"{source.name or 'the environment'} cannot be drawn: name one of Gymnasium's, of "
+            "dm_control's or of ours"
+        )
+    options = {} if mujoco_ else {"render_mode": "rgb_array"}
+    env = source.single(disturbances, control, **options)
+    shown: list[np.ndarray] = []
+
+    def record(*_: object) -> None:
+        shown.append(_pose(env) if mujoco_ else np.asarray(_unwrapped(env)._env.render()))
+
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
+        env.set_seed(stream_seed(seed, "play") % 2**31)
+        seed_streams(seed, "play")
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            data = env.rollout(steps, robust.policy, callback=record)
+    if not shown:
+        record()  # of an episode of a single step
+    ended = bool(data["next", "terminated"].any())
+    frames = shown
+    if mujoco_:
+        poses = np.stack(shown)
+        frames = (
+            rollout_frames(source.task, poses, size=size)
+            if source.task is not None
+            else draw_poses(_physics(env)[0], poses, size=size)
+        )
+    words = "L1 off" if l1 == OFF else f"L1 {l1}"
+    env.close()
+    return Film(words, frames, float(data["next", "reward"].sum()), ended)
+
+
+def _unwrapped(env: EnvBase) -> Any:
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env
+
+
+def _physics(env: EnvBase) -> tuple[mujoco.MjModel, Any] | None:
+    """MuJoCo's model and data behind an environment of Gymnasium or dm_control."""
+    found = simulation_of(env)
+    if found is not None:
+        return found.model, found.data
+    physics = getattr(getattr(_unwrapped(env), "_env", None), "physics", None)
+    return None if physics is None else (physics.model.ptr, physics.data)
+
+
+def _pose(env: EnvBase) -> np.ndarray:
+    base = _unwrapped(env)
+    if hasattr(base, "simulator_state"):
+        pose: np.ndarray = base.simulator_state()[0][0]
+        return pose
+    physics = _physics(env)
+    assert physics is not None
+    return np.array(physics[1].qpos)
+
+
+def side_by_side(films: Sequence[Film]) -> list[np.ndarray]:
+    """Frames with the films beside each other, labelled; a shorter one holds its last frame.
+
+    Examples:
+        >>> black = [np.zeros((40, 60, 3), np.uint8)]
+        >>> films = [Film("L1 off", black, 1.0, True), Film("L1 on", 3 * black, 3.0, False)]
+        >>> frames = side_by_side(films)
+        >>> len(frames), frames[0].shape
+        (3, (40, 120, 3))
+    """
+    count = max(len(one.frames) for one in films)
+    height = max(one.frames[0].shape[0] for one in films)
+    widths = [one.frames[0].shape[1] for one in films]
+    shown = []
+    for index in range(count):
+        image = Image.new("RGB", (sum(widths), height))
+        left = 0
+        for one, width in zip(films, widths, strict=True):
+            over = index >= len(one.frames)
+            frame = Image.fromarray(one.frames[-1 if over else index])
+            label = one.label + f", ended after {len(one.frames)} steps" * (over and one.ended)
+            ImageDraw.Draw(frame).text((6, 4), label, fill="white", stroke_width=2, stroke_fill=0)
+            image.paste(frame, (left, 0))
+            left += width
+        shown.append(np.asarray(image))
+    return shown
+
+
+def check_film(file: Path | None) -> None:
+    """Refuse, before any work, what cannot be written or shown here.
+
+    Raises:
+        ValueError: for another suffix, a missing package, or a machine without a display.
+    """
+    if file is None:
+        if sys.platform == "linux" and not os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}:
+            raise ValueError("there is no display to open a window on: give --output FILE.mp4")
+    elif file.suffix not in SUFFIXES:
+        raise ValueError(f"{file} must end in {' or '.join(SUFFIXES)}")
+    elif file.suffix == ".mp4":
+        require("imageio_ffmpeg", "video")
+
+
+def write_film(frames: Sequence[np.ndarray], file: str | Path, dt: float) -> Path:
+    """Write frames in real time, as far as a player can follow.
+
+    Args:
+        frames: RGB images.
+        file: ``.mp4``, which needs the extra ``video``, or ``.gif``.
+        dt: time of a step in seconds.
+
+    Returns:
+        the file.
+    """
+    file = Path(file)
+    check_film(file)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    # No more than fifty pictures a second.
+    every = max(1, round(0.02 / dt))
+    frames, seconds = list(frames)[::every], dt * every
+    if file.suffix == ".gif":
+        images = [Image.fromarray(frame) for frame in frames]
+        duration = max(20, round(1000 * seconds))
+        images[0].save(file, save_all=True, append_images=images[1:], duration=duration, loop=0)
+        return file
+    ffmpeg = require("imageio_ffmpeg", "video")
+    height, width = (side - side % 2 for side in frames[0].shape[:2])  # as the format asks
+    writer = ffmpeg.write_frames(str(file), (width, height), fps=1 / seconds, macro_block_size=2)
+    writer.send(None)
+    for frame in frames:
+        writer.send(np.ascontiguousarray(frame[:height, :width]))
+    writer.close()
+    return file
+
+
+def show_film(frames: Sequence[np.ndarray], dt: float, title: str) -> None:
+    """Show frames in a window until it is closed.
+
+    Raises:
+        ValueError: if no window can be opened.
+    """
+    for backend in ("macosx", "TkAgg", "QtAgg", "GTK3Agg"):
+        try:
+            pyplot.switch_backend(backend)
+            break
+        except ImportError:
+            continue
+    else:
+        raise ValueError(
+            "no toolkit of windows is installed (such as python3-tk): give --output FILE.mp4"
+        )
+    height, width = frames[0].shape[:2]
+    figure = pyplot.figure(title, figsize=(width / 100, height / 100), dpi=100)
+    axis = figure.add_axes((0, 0, 1, 1))
+    axis.set_axis_off()
+    image = axis.imshow(frames[0])
+
+    def draw(index: int) -> list[Any]:
+        image.set_data(frames[index])
+        return [image]
+
+    animation = FuncAnimation(figure, draw, len(frames), interval=1000 * dt, blit=True)
+    pyplot.show()
+    del animation

@@ -1,0 +1,317 @@
+"""Policies from files, functions and run directories, as TorchRL modules."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import pickle
+import warnings
+import zipfile
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.data import Bounded, TensorSpec
+from torchrl.envs import EnvBase
+
+from torchrl_l1.deployment.environments import load_attribute, require
+from torchrl_l1.experiment.evaluate import load_run
+
+Policy = str | TensorDictModuleBase | nn.Module | Callable[[Tensor], Any]
+"""A source, a TorchRL module, a model of Stable-Baselines3, or a function of the observation."""
+
+NO_NORMALIZATION = "none"
+"""In place of the file of VecNormalize: there is one, and it is to be left alone."""
+
+_STATISTICS = "vecnormalize.pkl"
+
+_FORMS = "sb3:FILE.zip, torchscript:FILE, onnx:FILE, MODULE:NAME, FILE.py:NAME, or a run directory"
+
+
+class FunctionPolicy(TensorDictModuleBase):
+    """A policy that is a function of the observation, as a TorchRL module.
+
+    It reads ``observation`` and writes ``action``, on batches as on single observations. A
+    function that takes one observation at a time is called for each by itself.
+
+    Args:
+        function: from an observation ``(n,)``, or several ``(N, n)``, to actions as a tensor, an
+            array or numbers. Modules stay in train or evaluation mode as they are.
+        observation: spec of the observation, its last dimension n.
+        action: spec of the action, whose shape, type and bounds count.
+        rows: whether the function takes one observation at a time; found out if ``None``.
+
+    Raises:
+        ValueError: if the function returns no action for an observation of zeros.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.envs import GymEnv
+        >>> env = GymEnv("Pendulum-v1")
+        >>> policy = FunctionPolicy(
+        ...     lambda x: [-2.0 * x[1]], env.observation_spec["observation"], env.action_spec
+        ... )
+        >>> data = TensorDict(observation=torch.ones(5, 3), batch_size=[5])
+        >>> policy(data)["action"].shape
+        torch.Size([5, 1])
+    """
+
+    in_keys = ["observation"]  # noqa: RUF012
+    out_keys = ["action"]  # noqa: RUF012
+
+    def __init__(
+        self,
+        function: Callable[[Tensor], Any],
+        observation: TensorSpec,
+        action: TensorSpec,
+        rows: bool | None = None,
+    ) -> None:
+        super().__init__()
+        self.function = function
+        self.width = action.shape[-1]
+        self.dtype = action.dtype
+        bounds = action.space if isinstance(action, Bounded) else None
+        for name, side in (("low", "low"), ("high", "high")):
+            value = None if bounds is None else getattr(bounds, side).reshape(-1, self.width)[0]
+            self.register_buffer(name, value)
+        n = observation.shape[-1]
+        self.rows = self._one_at_a_time(n) if rows is None else rows
+
+    @torch.no_grad()
+    def _one_at_a_time(self, n: int) -> bool:
+        probe = torch.linspace(-0.1, 0.1, 2 * n).reshape(2, n)
+        try:
+            together = self._call(probe)
+        except Exception:  # of a function that does not know batches, anything
+            together = torch.empty(0)
+        if together.shape == (2, self.width):
+            return False
+        try:
+            alone = self._call(probe[0])
+        except Exception as error:
+            raise ValueError(
+                f"the policy failed at an observation of width {n}: {error}"
+            ) from error
+        if alone.numel() != self.width:
+            raise ValueError(
+                f"the policy returned shape {tuple(alone.shape)} for an observation of width {n}; "
+                f"expected an action of width {self.width}"
+            )
+        return True
+
+    def _call(self, observation: Tensor) -> Tensor:
+        found = self.function(observation)
+        found = found[0] if isinstance(found, tuple) else found
+        return torch.as_tensor(np.asarray(found) if isinstance(found, list) else found)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action, within its bounds."""
+        return tensordict.set("action", self.act(tensordict.get("observation")))
+
+    def act(self, observation: Tensor) -> Tensor:
+        """Actions ``(..., m)`` for observations ``(..., n)``."""
+        batch = observation.shape[:-1]
+        flat = observation.reshape(-1, observation.shape[-1])
+        if self.rows:
+            found = torch.stack([self._call(row).reshape(self.width) for row in flat])
+        else:
+            found = self._call(flat)
+        action = found.reshape(*batch, self.width).to(self.dtype)
+        return action if self.low is None else action.clamp(self.low, self.high)
+
+
+class StableBaselinesPolicy(nn.Module):
+    """The deterministic action of a policy of Stable-Baselines3, with its normalisation.
+
+    Args:
+        policy: ``model.policy``.
+        statistics: mean, variance, epsilon and clipping of VecNormalize.
+    """
+
+    def __init__(
+        self, policy: Any, statistics: tuple[Tensor, Tensor, float, float] | None = None
+    ) -> None:
+        super().__init__()
+        policy.set_training_mode(False)
+        self.policy = policy
+        self.squashed = bool(policy.squash_output)
+        self.dtype = torch.float32
+        space = policy.action_space
+        self.register_buffer("low", torch.as_tensor(space.low))
+        self.register_buffer("high", torch.as_tensor(space.high))
+        mean, variance, self.epsilon, self.clip = statistics or (None, None, 0.0, 0.0)
+        self.register_buffer("mean", mean)
+        self.register_buffer("variance", variance)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Actions ``(N, m)`` for raw observations ``(N, n)``."""
+        if self.mean is not None:
+            scaled = (observation - self.mean) / (self.variance + self.epsilon).sqrt()
+            observation = scaled.clamp(-self.clip, self.clip)
+        action = self.policy._predict(observation.to(self.dtype), deterministic=True)
+        if self.squashed:
+            return self.low + 0.5 * (action + 1.0) * (self.high - self.low)
+        return torch.maximum(torch.minimum(action, self.high), self.low)
+
+
+def load_policy(
+    policy: Policy,
+    env: EnvBase,
+    normalization: str | None = None,
+    weights: str | None = None,
+) -> TensorDictModuleBase:
+    """A policy as a TorchRL module that reads ``observation`` and writes ``action``.
+
+    ==================== ===========================================================
+    policy               what it is
+    ==================== ===========================================================
+    ``sb3:FILE.zip``     a model of Stable-Baselines3, its deterministic action
+    ``torchscript:FILE`` a TorchScript module from observations to actions
+    ``onnx:FILE``        an ONNX model, its first input and its first output
+    ``MODULE:NAME``      or ``FILE.py:NAME``: a policy, or a function without
+                         arguments that returns one
+    a run directory      the policy of the run's last stage
+    ==================== ===========================================================
+
+    TorchRL modules, models of Stable-Baselines3 and functions of the observation are taken as
+    objects, too. Files of Stable-Baselines3 hold pickles, which execute code when they are
+    loaded: open those only that you trust.
+
+    Args:
+        policy: a source or an object.
+        env: the environment that it is for, see
+            :func:`~torchrl_l1.deployment.environments.vector_environment`.
+        normalization: file of the statistics of VecNormalize, a pickle, or ``"none"``.
+        weights: file of a state dict to load into the module; pickles are refused in it.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: for a source that stands for nothing, a file beside it that changes what the
+            policy sees and is not mentioned, or a policy that returns no action.
+    """
+    if normalization is not None and not (isinstance(policy, str) and policy.startswith("sb3:")):
+        raise ValueError("normalization belongs to policies of Stable-Baselines3, sb3:FILE.zip")
+    found = _from_source(policy, normalization) if isinstance(policy, str) else policy
+    predicts = getattr(found, "predict", None)
+    if callable(predicts) and hasattr(getattr(found, "policy", None), "squash_output"):
+        found = StableBaselinesPolicy(found.policy)  # a model of Stable-Baselines3
+    if weights is not None:
+        if not isinstance(found, nn.Module):
+            raise ValueError(
+                f"weights go into a module, and the policy is a {type(found).__name__}"
+            )
+        found.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
+    if isinstance(found, TensorDictModuleBase):
+        return found
+    if not callable(found):
+        raise ValueError(f"a {type(found).__name__} is no policy; policies are {_FORMS}")
+    observation = env.full_observation_spec["observation"]
+    return FunctionPolicy(found, observation, env.full_action_spec["action"])
+
+
+def _from_source(source: str, normalization: str | None) -> Any:
+    kind, _, rest = source.partition(":")
+    if kind in _FILES and rest:
+        if not Path(rest).is_file():
+            raise FileNotFoundError(f"there is no file {rest}")
+        if kind == "sb3":
+            return _stable_baselines(Path(rest), normalization)
+        return _FILES[kind](rest)
+    if Path(source).is_dir():
+        return list(load_run(source).algorithm.policies.values())[-1]
+    if not rest:
+        raise ValueError(f"unknown policy {source!r}; policies are {_FORMS}")
+    return _from_code(source)
+
+
+def _from_code(source: str) -> Any:
+    found = load_attribute(source)
+    if isinstance(found, nn.Module) or not callable(found):
+        return found
+    try:
+        needed = [
+            parameter
+            for parameter in inspect.signature(found).parameters.values()
+            if parameter.default is parameter.empty
+            and parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
+        ]
+    except ValueError:  # built in
+        return found
+    return found if needed else found()
+
+
+def _torchscript(file: str) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch's own, that TorchScript is no longer developed
+        return torch.jit.load(file, map_location="cpu").eval()
+
+
+def _onnx(file: str) -> Any:
+    runtime = require("onnxruntime", "onnx")
+    session = runtime.InferenceSession(file, providers=["CPUExecutionProvider"])
+    first = session.get_inputs()[0]
+    kind = np.float64 if first.type == "tensor(double)" else np.float32
+    batched = len(first.shape) > 1
+
+    def act(observation: Tensor) -> Tensor:
+        values = observation.detach().cpu().numpy().astype(kind)
+        if batched and values.ndim == 1:
+            return torch.as_tensor(session.run(None, {first.name: values[None]})[0])[0]
+        return torch.as_tensor(session.run(None, {first.name: values})[0])
+
+    return act
+
+
+_FILES: dict[str, Callable[[str], Any]] = {
+    "torchscript": _torchscript,
+    "onnx": _onnx,
+    "sb3": lambda file: _stable_baselines(Path(file), None),
+}
+
+
+def _stable_baselines(file: Path, normalization: str | None) -> StableBaselinesPolicy:
+    require("stable_baselines3", "sb3")
+    beside = file.with_name(_STATISTICS)
+    if normalization is None and beside.exists():
+        raise ValueError(
+            f"{beside} stands beside {file.name}: give it as normalization (--normalization "
+            f"{beside}), which loads a pickle and so executes what is in it, or say "
+            f"{NO_NORMALIZATION!r} if the policy does without"
+        )
+    with zipfile.ZipFile(file) as archive:
+        home = json.loads(archive.read("data"))["policy_class"]["__module__"]
+    model = _algorithm(home).load(file, device="cpu")
+    statistics = None
+    if normalization not in (None, NO_NORMALIZATION):
+        with open(str(normalization), "rb") as handle:
+            stored = pickle.load(handle)
+        moments = stored.obs_rms
+        statistics = (
+            torch.as_tensor(moments.mean, dtype=torch.float64),
+            torch.as_tensor(moments.var, dtype=torch.float64),
+            float(stored.epsilon),
+            float(stored.clip_obs),
+        )
+        if not stored.norm_obs:
+            statistics = None
+    return StableBaselinesPolicy(model.policy, statistics)
+
+
+def _algorithm(home: str) -> Any:
+    """The class of the model, from the module that its policy's class is of."""
+    package, *inner = home.split(".")
+    if package in ("stable_baselines3", "sb3_contrib") and inner[0] != "common":
+        algorithms = import_module(f"{package}.{inner[0]}")
+        return next(
+            value
+            for name, value in vars(algorithms).items()
+            if name.lower() == inner[0].lower() and inspect.isclass(value)
+        )
+    # Of algorithms whose policies are the common ones the class makes no difference.
+    return import_module("stable_baselines3").PPO

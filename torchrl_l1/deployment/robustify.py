@@ -1,0 +1,399 @@
+"""From a policy to a robust one: collect, fit, calibrate, and what comes out of it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase, TransformedEnv
+from tqdm import tqdm
+
+from torchrl_l1.checks import check_choice, check_count, check_not_negative, check_positive
+from torchrl_l1.control import L1Config, L1Transform
+from torchrl_l1.deployment.assessment import Assessment, Disturbances, assess
+from torchrl_l1.deployment.environments import (
+    EnvironmentSource,
+    MakeEnv,
+    environment_source,
+    vector_environment,
+)
+from torchrl_l1.deployment.learning import (
+    collect,
+    epsilon_for,
+    policy_transforms,
+    target_switch_rate,
+)
+from torchrl_l1.deployment.policies import Policy, load_policy
+from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, fit_dynamics
+from torchrl_l1.experiment.evaluate import load_run
+from torchrl_l1.experiment.l1_options import OFF, closest_option, l1_option
+from torchrl_l1.experiment.run_directory import write_atomically
+from torchrl_l1.experiment.settings import l1_config
+
+PRESETS = ("robust", "paper")
+"""Settings of L1 that a policy can be given, the default first."""
+
+MODEL: Mapping[str, Any] = {"hidden": (128, 128)}
+"""Arguments of :func:`~torchrl_l1.dynamics.make_dynamics` where none are given."""
+
+FIT = FitConfig(max_epochs=200, max_gradient_steps=2000, patience=10, batch_size=256)
+"""How the model is fitted where nothing else is said."""
+
+_FORMAT = 1
+_FILE, _MODEL = "controller.json", "model.safetensors"
+
+
+@dataclass
+class RobustController:
+    """A policy with a model of what it acts on, and L1 around it; :func:`robustify` makes it.
+
+    Attributes:
+        source: makes its environments.
+        policy: reads ``observation`` and writes ``action``.
+        model: the learned dynamics.
+        configs: settings of L1 by preset, bounds of the action included.
+        preset: the one that acts by default.
+        origin: how the policy is found again.
+    """
+
+    source: EnvironmentSource
+    policy: TensorDictModuleBase
+    model: EnsembleDynamics
+    configs: dict[str, L1Config]
+    preset: str = PRESETS[0]
+    origin: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def config(self) -> L1Config:
+        """The settings of L1 that act by default."""
+        return self.configs[self.preset]
+
+    def wrap(self, env: EnvBase, preset: str | None = None) -> TransformedEnv:
+        """An environment with L1 between it and the policy.
+
+        Args:
+            env: as :func:`robustify` was given, or with disturbances on it, batched or not.
+            preset: the settings; those that act by default if ``None``.
+
+        Returns:
+            with an ``L1Transform`` as its last transform: ``env.rollout(1000, robust.policy)``.
+        """
+        config = self.settings(preset)
+        env = TransformedEnv(vector_environment(env), auto_unwrap=True)
+        for transform in [*policy_transforms(self.policy), L1Transform(self.model, config)]:
+            env.append_transform(transform)
+        return env
+
+    def settings(self, preset: str | None) -> L1Config:
+        """The settings of a preset; those that act by default if ``None``.
+
+        Raises:
+            ValueError: for a preset that there is not.
+        """
+        name = self.preset if preset is None else preset
+        check_choice("preset", name, tuple(self.configs))
+        return self.configs[name]
+
+    def evaluate(
+        self,
+        disturbances: Disturbances,
+        *,
+        episodes: int = 10,
+        most_steps: int = 1000,
+        seed: int = 0,
+        progress: bool | None = None,
+    ) -> Assessment:
+        """Test the policy under disturbances: L1 off, each preset, and the oracle.
+
+        All see the same resets. The oracle, which is told the disturbance, is tested where
+        disturbances are matched, and says what is possible.
+
+        Args:
+            disturbances: values by name, ``{"bias": [0.5, 1.0]}``, or a suite, ``"quick"``; see
+                :data:`~torchrl_l1.envs.DISTURBANCES`.
+            episodes: in each cell.
+            most_steps: after which an episode is cut off.
+            seed: of the resets and of what disturbances draw.
+            progress: whether to show a bar; if ``None``, where there is a terminal.
+
+        Raises:
+            ValueError: for what is no disturbance, or cannot act on the environment.
+        """
+        check_count("episodes", episodes)
+        check_count("most_steps", most_steps)
+        name = self.source.name
+        heading = f"{name.removeprefix('gymnasium/')}: L1 off and on" if name else "L1 off and on"
+        with _private_randomness(), _bar("evaluate", "cell", progress) as bar:
+
+            def advance(total: int) -> None:
+                bar.total = total
+                bar.update()
+
+            return assess(
+                self.source, self.policy, self.model, self.configs, disturbances, episodes,
+                most_steps, seed, advance, heading,
+            )  # fmt: skip
+
+    def save(self, folder: str | Path) -> Path:
+        """Write model, settings and, where the policy came from a file, that file to a folder.
+
+        There are no pickles of ours among them; the policy's own files are what they were.
+
+        Returns:
+            the folder.
+        """
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        origin = dict(self.origin)
+        kind, _, file = str(origin.get("policy") or "").partition(":")
+        if kind in ("sb3", "torchscript", "onnx"):
+            origin["policy"] = f"{kind}:{_copied(Path(file), folder)}"
+        for name in ("normalization", "weights"):
+            if origin.get(name) and Path(origin[name]).is_file():
+                origin[name] = _copied(Path(origin[name]), folder)
+        stored = {
+            "format": _FORMAT,
+            "environment": self.source.name,
+            **origin,
+            "preset": self.preset,
+            "configs": {name: asdict(config) for name, config in self.configs.items()},
+        }
+        self.model.save(folder / _MODEL)
+        write_atomically(folder / _FILE, json.dumps(stored, indent=2) + "\n")
+        return folder
+
+    @classmethod
+    def load(
+        cls,
+        folder: str | Path,
+        make_env: MakeEnv | None = None,
+        policy: Policy | None = None,
+    ) -> RobustController:
+        """Read what :meth:`save` wrote.
+
+        Args:
+            folder: the folder.
+            make_env: the environment; the one of the folder if ``None``.
+            policy: the policy, likewise.
+
+        Raises:
+            FileNotFoundError: if there is no such folder.
+            ValueError: if environment or policy were given as objects, which no folder holds, and
+                are not given again.
+        """
+        folder = Path(folder)
+        if not (folder / _FILE).exists():
+            raise FileNotFoundError(f"{folder} holds no controller: there is no {_FILE}")
+        stored = json.loads((folder / _FILE).read_text(encoding="utf-8"))
+        if stored["format"] != _FORMAT:
+            raise ValueError(
+                f"{folder / _FILE} has the format {stored['format']}, and this version reads "
+                f"{_FORMAT}: robustify the policy again"
+            )
+        for what, value in (("make_env", make_env), ("policy", policy)):
+            if value is None and not stored["environment" if what == "make_env" else what]:
+                raise ValueError(f"{folder} names no {what}, which was an object: give it again")
+        source = environment_source(stored["environment"] if make_env is None else make_env)
+        names = {key: stored.get(key) for key in ("policy", "normalization", "weights")}
+        if policy is None:
+            found = {key: _placed(value, folder) for key, value in names.items()}
+            policy, given = found.pop("policy"), found
+        else:
+            given = {"normalization": None, "weights": None}
+        assert policy is not None
+        return cls(
+            source,
+            load_policy(policy, source.one(), **given),
+            EnsembleDynamics.load(folder / _MODEL),
+            {name: L1Config(**values) for name, values in stored["configs"].items()},
+            stored["preset"],
+            {"policy": policy if isinstance(policy, str) else None, **given},
+        )
+
+
+def _copied(file: Path, folder: Path) -> str:
+    """Put a copy of a file into a folder, unless it is that of the folder; its name."""
+    target = folder / file.name
+    if file.resolve() != target.resolve():
+        shutil.copyfile(file, target)
+    return file.name
+
+
+def _placed(name: str | None, folder: Path) -> str | None:
+    """Where a file lies whose name a controller holds."""
+    kind, colon, file = (name or "").rpartition(":")
+    return f"{kind}{colon}{folder / file}" if name and (folder / file).is_file() else name
+
+
+def robustify(
+    make_env: MakeEnv,
+    policy: Policy,
+    steps: int = 20_000,
+    *,
+    preset: str = PRESETS[0],
+    dt: float | None = None,
+    epsilon: float | None = None,
+    switch_rate: float | None = None,
+    normalization: str | None = None,
+    weights: str | None = None,
+    environments: int = 10,
+    noise: float = 0.3,
+    model: Mapping[str, Any] | None = None,
+    fit: FitConfig | None = None,
+    seed: int = 0,
+    progress: bool | None = None,
+) -> RobustController:
+    """Put L1 around a policy: collect data with it, fit a model, calibrate the controller.
+
+    The policy stays as it is. Nothing need be known of the disturbances, which are not in the
+    data.
+
+    Args:
+        make_env: an environment by name, or a function that makes one, see
+            :func:`environment_source`.
+        policy: a source, a module or a function, see :func:`load_policy`.
+        steps: steps of the environment that are collected, with exploration noise.
+        preset: ``"robust"`` or ``"paper"``, the settings of L1 that act by default; both are
+            calibrated and evaluated.
+        dt: time of a step in seconds; the environment's own if ``None``.
+        epsilon: tolerance of the paper's switching law, state units.
+        switch_rate: switches per 1000 steps that epsilon is found from otherwise; if ``None``, in
+            the middle of the paper's rule of thumb, see :func:`target_switch_rate`.
+        normalization: statistics of VecNormalize, see :func:`load_policy`.
+        weights: state dict of the policy, see :func:`load_policy`.
+        environments: environments that are stepped at once.
+        noise: exploration, as a fraction of half the range of the action, see :class:`Exploration`.
+        model: arguments of :func:`~torchrl_l1.dynamics.make_dynamics` beside the widths.
+        fit: how the model is fitted.
+        seed: of data and weights; torch's global generator is left as it was.
+        progress: whether to show bars and print what the model is worth; if ``None``, bars where
+            there is a terminal.
+
+    Raises:
+        ValueError: for a setting out of its domain, an environment that does not tell its time
+            step, or observations and actions that are no vectors.
+
+    Examples:
+        >>> from torchrl_l1.dynamics import FitConfig
+        >>> robust = robustify(
+        ...     "inverted_pendulum", lambda x: -x[..., 1:2], steps=200, progress=False,
+        ...     model={"hidden": [8]}, fit=FitConfig(max_epochs=1), environments=2,
+        ... )
+        >>> robust.config.dt, robust.preset
+        (0.04, 'robust')
+    """
+    check_choice("preset", preset, PRESETS)
+    check_count("steps", steps)
+    check_count("environments", environments)
+    check_not_negative("noise", noise)
+    if dt is not None:
+        check_positive("dt", dt)
+    source = environment_source(make_env)
+    dt = source.time_step() if dt is None else dt
+    if dt is None:
+        raise ValueError(
+            f"{source.name or 'the environment'} does not tell the time of its steps: give dt "
+            "(--dt), in seconds"
+        )
+    with _private_randomness():
+        env = source.one()
+        acting = load_policy(policy, env, normalization, weights)
+        with _bar("collect", "step", progress) as bar:
+            bar.total = steps
+            data = collect(source, acting, steps, environments, noise, seed, bar.update)
+        with _bar("fit", "epoch", progress) as bar:
+            dynamics = fit_dynamics(
+                data, config=fit or FIT, seed=seed, on_epoch=lambda _: bar.update(),
+                **{**MODEL, **(model or {})},
+            )  # fmt: skip
+    if progress is not False:
+        print(dynamics.quality)
+    if epsilon is None:
+        n = dynamics.observation_dim
+        rate = target_switch_rate(n) if switch_rate is None else switch_rate
+        epsilon, _ = epsilon_for(dynamics, data, rate)
+    origin = {
+        "policy": policy if isinstance(policy, str) else None,
+        "normalization": normalization,
+        "weights": weights,
+    }
+    configs = {"robust": L1Config.robust(dt), "paper": L1Config.paper(dt, epsilon=epsilon)}
+    order = [preset, *(name for name in PRESETS if name != preset)]
+    return RobustController(
+        source, acting, dynamics, {name: configs[name] for name in reversed(order)},
+        preset, origin,
+    )  # fmt: skip
+
+
+def load_target(
+    target: str,
+    policy: str | None = None,
+    normalization: str | None = None,
+    weights: str | None = None,
+) -> RobustController:
+    """What a command is about: a controller, a run, or a policy in its environment.
+
+    Args:
+        target: a folder that :func:`robustify`'s command or :meth:`RobustController.save` wrote, a
+            run directory, whose own model and settings count, or an environment by name.
+        policy: the policy in that environment, which then has no L1.
+        normalization: see :func:`load_policy`.
+        weights: likewise.
+
+    Raises:
+        ValueError: if it is none of them, or a policy is given beside a folder.
+    """
+    folder = Path(target)
+    if folder.is_dir():
+        if policy is not None:
+            raise ValueError(f"{target} has a policy of its own: leave --policy out")
+        for place in (folder, folder / "controller"):
+            if (place / _FILE).exists():
+                return RobustController.load(place)
+        return _of_run(folder)
+    if policy is None:
+        raise ValueError(
+            f"there is no folder {target}; give a controller, a run directory, or an environment "
+            "with --policy"
+        )
+    source = environment_source(target)
+    acting = load_policy(policy, source.one(), normalization, weights)
+    return RobustController(source, acting, EnsembleDynamics(1, 1, hidden=()), {}, OFF)
+
+
+def _of_run(folder: Path) -> RobustController:
+    """A training with its own model; with its own L1, where it has one of that kind."""
+    run = load_run(folder)
+    own, task = run.recipe.l1, run.recipe.task
+    configs = {}
+    for name in reversed(PRESETS):
+        settings = own
+        if closest_option(own, task) != name:
+            settings = replace(l1_option(name), epsilon=own.epsilon)
+        config = l1_config(settings, task)
+        assert config is not None
+        configs[name] = config
+    policy = list(run.algorithm.policies.values())[-1]
+    model = run.algorithm.acting_dynamics
+    origin = {"policy": str(folder)}
+    return RobustController(environment_source(task), policy, model, configs, origin=origin)
+
+
+@contextmanager
+def _private_randomness() -> Iterator[None]:
+    """What is drawn inside leaves torch's global generator as it was."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        yield
+
+
+def _bar(words: str, unit: str, progress: bool | None) -> tqdm:
+    disable = None if progress is None else not progress
+    return tqdm(desc=words, unit=unit, disable=disable)

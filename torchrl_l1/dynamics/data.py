@@ -1,0 +1,326 @@
+"""Recorded data of other kinds, as tensordicts of transitions such as TorchRL's collectors make."""
+
+from __future__ import annotations
+
+import csv
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
+
+_Path = str | os.PathLike[str]
+
+# Steps of time that differ by more from the usual one are gaps.
+_JITTER = 0.1
+
+
+def read_csv(
+    path: _Path,
+    *,
+    observation: Sequence[str],
+    action: Sequence[str],
+    episode: str | None = None,
+    time: str | None = None,
+    delimiter: str = ",",
+) -> TensorDict:
+    r"""Transitions of a real system from a table, one line per sampling instant.
+
+    A line holds what was measured and the action that was sent to the actuators from then until
+    the next line. Two lines that follow each other in an episode make one transition, so that the
+    action of the last line of an episode is not used. Empty cells count as NaN; what is done
+    with them is up to the reader of the transitions, such as
+    :func:`~torchrl_l1.dynamics.fit_dynamics`.
+
+    Args:
+        path: of the file, its first line the names of the columns.
+        observation: columns of the observation, n of them.
+        action: columns of the action, m of them.
+        episode: column that numbers or names the episodes; one episode if ``None``.
+        time: column of the time, s. Where it goes back a new episode begins, as it does with a
+            warning where a step is not the usual one to within a tenth: a gap.
+        delimiter: between the cells.
+
+    Returns:
+        ``observation`` ``(N, n)``, ``action`` ``(N, m)``, flags, what follows under ``"next"``,
+        ``("collector", "traj_ids")`` and with a column of time ``dt`` ``(N, 1)``, the usual step;
+        batch size ``[N]``, float64.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        KeyError: if there is no such column.
+        ValueError: for a cell that is no number, or if no two lines follow each other.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from tempfile import mkdtemp
+        >>> file = Path(mkdtemp()) / "drive.csv"
+        >>> rows = ["time,angle,rate,torque", "0,0,0,1", "0.1,0,0.5,1", "0.2,0.05,1,0"]
+        >>> _ = file.write_text("\n".join(rows))
+        >>> data = read_csv(file, observation=["angle", "rate"], action=["torque"], time="time")
+        >>> data["next", "observation"]
+        tensor([[0.0000, 0.5000],
+                [0.0500, 1.0000]], dtype=torch.float64)
+        >>> data["dt"][0].item()
+        0.1
+    """
+    numbers = [*observation, *action, *([] if time is None else [time])]
+    wanted = [*numbers, *([] if episode is None else [episode])]
+    columns = _columns(path, wanted, numbers, delimiter)
+    x, u = (
+        torch.tensor([columns[name] for name in names], dtype=torch.float64).T
+        for names in (observation, action)
+    )
+    clock = None if time is None else torch.tensor(columns[time], dtype=torch.float64)
+    labels = None if episode is None else np.array(columns[episode])
+    return _rows(str(path), x, u, labels, clock)
+
+
+def read_npz(
+    path: _Path,
+    *,
+    observation: str | Sequence[str],
+    action: str | Sequence[str],
+    episode: str | None = None,
+    time: str | None = None,
+) -> TensorDict:
+    """As :func:`read_csv`, from arrays saved by :func:`numpy.savez`.
+
+    Arrays are ``(T,)`` or ``(T, k)``, one row per sampling instant; several are put side by side.
+    The observations may have one row more than the actions, the last one of a single episode.
+
+    Args:
+        path: of the file.
+        observation: names of the arrays that make up the observation.
+        action: names of those that make up the action.
+        episode: name of the array that numbers the episodes ``(T,)``; one episode if ``None``.
+        time: name of the array of the time ``(T,)``, s.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        KeyError: if there is no such array.
+        ValueError: if arrays are not numbers of one length, or the file is none of NumPy's.
+    """
+    try:
+        file = np.load(path, allow_pickle=False)
+        if isinstance(file, np.ndarray):
+            raise ValueError("a single array; save several by name with numpy.savez")
+        with file:
+            arrays = {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path}: no such file") from None
+    except Exception as error:
+        raise ValueError(f"{path} is no readable .npz file: {error}") from None
+
+    def array(name: str) -> np.ndarray:
+        if name not in arrays:
+            raise KeyError(f"{path} has no array {name!r}, only {', '.join(arrays)}")
+        return arrays[name]
+
+    def side_by_side(names: str | Sequence[str]) -> Tensor:
+        parts = []
+        for name in [names] if isinstance(names, str) else names:
+            values = array(name)
+            if values.dtype.kind not in "fiub" or values.ndim not in (1, 2):
+                raise ValueError(
+                    f"{path}: {name!r} has shape {list(values.shape)} and type {values.dtype}, "
+                    "expected numbers of shape [T] or [T, k]"
+                )
+            parts.append(torch.from_numpy(values.astype(np.float64)).reshape(len(values), -1))
+        lengths = {len(part) for part in parts}
+        if len(lengths) != 1:
+            raise ValueError(f"{path}: {names} have lengths {sorted(lengths)}, expected one length")
+        return torch.cat(parts, -1)
+
+    x, u = side_by_side(observation), side_by_side(action)
+    if len(x) == len(u) + 1:
+        u = torch.cat([u, u.new_zeros(1, u.shape[-1])])
+    clock = None if time is None else side_by_side(time).squeeze(-1)
+    labels = None if episode is None else array(episode).reshape(-1)
+    for name, values in (("action", u), (time, clock), (episode, labels)):
+        if values is not None and len(values) != len(x):
+            raise ValueError(f"{path}: {name} has {len(values)} rows, the observation {len(x)}")
+    return _rows(str(path), x, u, labels, clock)
+
+
+def read_minari(dataset: str | MinariDataset, download: bool = False) -> TensorDict:
+    """Transitions of a Minari dataset; needs the extra ``minari``.
+
+    Args:
+        dataset: name of a dataset, such as ``"mujoco/inverteddoublependulum/medium-v0"``, or the
+            dataset itself, of which :meth:`~minari.MinariDataset.filter_episodes` may have left a
+            part.
+        download: whether to fetch it if it is not on this machine.
+
+    Returns:
+        ``observation``, ``action``, ``reward``, flags and what follows under ``"next"``,
+        ``("collector", "traj_ids")``; batch size ``[N]``. The entries of a dictionary of
+        observations have their own keys, as in TorchRL's ``GymEnv``.
+
+    Raises:
+        FileNotFoundError: if the dataset is not on this machine.
+        ModuleNotFoundError: without Minari.
+        TypeError: if actions are not vectors, or observations neither vectors nor dictionaries.
+        ValueError: if there are no episodes.
+    """
+    try:
+        import minari
+        from gymnasium.spaces import Box
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            "reading a Minari dataset needs Minari: pip install 'torchrl-l1[minari]'"
+        ) from None
+    if isinstance(dataset, str):
+        dataset = minari.load_dataset(dataset, download=download)
+    if not isinstance(dataset.action_space, Box):
+        raise TypeError(
+            f"the dataset has actions of {dataset.action_space}: L1 needs vectors of numbers, a Box"
+        )
+    episodes = []
+    for number, episode in enumerate(dataset.iterate_episodes()):
+        flags = {
+            "terminated": torch.from_numpy(np.array(episode.terminations, dtype=bool))[:, None],
+            "truncated": torch.from_numpy(np.array(episode.truncations, dtype=bool))[:, None],
+        }
+        reward = torch.from_numpy(np.array(episode.rewards))[:, None]
+        actions = torch.from_numpy(np.array(episode.actions)).flatten(1)
+        seen = TensorDict(_nested(episode.observations), batch_size=[len(actions) + 1])
+        ids = torch.full((len(actions),), number)
+        episodes.append(_step(seen[:-1], seen[1:], actions, ids, flags, reward))
+    if not episodes:
+        raise ValueError(f"the dataset {dataset.spec.dataset_id} has no episodes")
+    return _named(torch.cat(episodes))
+
+
+def _columns(
+    path: _Path, wanted: Sequence[str], numbers: Sequence[str], delimiter: str
+) -> dict[str, list[Any]]:
+    """Columns of a table by name; those of ``numbers`` as numbers, empty cells as NaN."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    # A byte order mark is none of the first column's name.
+    with open(path, newline="", encoding="utf-8-sig") as file:
+        lines = csv.reader(file, delimiter=delimiter)
+        header = [name.strip() for name in next(lines, [])]
+        if header:
+            header[0] = header[0].removeprefix("#").strip()
+        for name in wanted:
+            if name not in header:
+                there = ", ".join(header) or "no first line"
+                hint = "" if len(header) > 1 else f", cells taken to be apart by {delimiter!r}"
+                raise KeyError(f"{path} has no column {name!r}, only {there}{hint}")
+        places = {name: header.index(name) for name in wanted}
+        columns: dict[str, list[Any]] = {name: [] for name in wanted}
+        for line in lines:
+            if not any(cell.strip() for cell in line):
+                continue
+            for name, place in places.items():
+                cell = line[place].strip() if place < len(line) else ""
+                if name in numbers:
+                    try:
+                        columns[name].append(float(cell or "nan"))
+                    except ValueError:
+                        raise ValueError(
+                            f"{path}, line {lines.line_num}, column {name!r}: {cell!r} is no number"
+                        ) from None
+                else:
+                    columns[name].append(cell)
+    return columns
+
+
+def _rows(
+    path: str, x: Tensor, u: Tensor, labels: np.ndarray | None, clock: Tensor | None
+) -> TensorDict:
+    """Transitions between rows that follow each other."""
+    ids = torch.zeros(len(x), dtype=torch.long)
+    if labels is not None and len(labels):
+        ids = torch.from_numpy(np.unique(labels, return_inverse=True)[1].reshape(-1))
+        order = ids.argsort(stable=True)
+        x, u, ids = x[order], u[order], ids[order]
+        clock = None if clock is None else clock[order]
+    joined = ids[1:] == ids[:-1]
+    extras = {}
+    if clock is not None and len(clock) > 1:
+        dt, joined = _steps(path, clock, joined)
+        extras["dt"] = torch.full((len(x) - 1, 1), dt, dtype=x.dtype)
+    if not joined.any():
+        raise ValueError(f"{path} has {len(x)} rows, of which none follows another in its episode")
+    trajectory = torch.cat([torch.zeros(1, dtype=torch.long), (~joined).cumsum(0)])
+    last = torch.ones_like(joined)
+    last[:-1] = ~joined[1:]
+    data = _step(
+        TensorDict({"observation": x[:-1]}, batch_size=[len(joined)]),
+        TensorDict({"observation": x[1:]}, batch_size=[len(joined)]),
+        u[:-1],
+        trajectory[:-1],
+        {"terminated": torch.zeros_like(last)[:, None], "truncated": last[:, None]},
+    )
+    return _named(data.update(extras)[joined])
+
+
+def _steps(path: str, clock: Tensor, joined: Tensor) -> tuple[float, Tensor]:
+    """The usual step of time, s, and which rows are followed by the next one after that."""
+    steps = clock.diff()
+    onward = joined & (steps > 0)
+    if not onward.any():
+        raise ValueError(f"{path}: the time never goes on from one row to the next")
+    dt = float(steps[onward].median())
+    even = (steps - dt).abs() <= _JITTER * dt
+    gaps = int((joined & ~even & ~(steps <= 0)).sum())
+    if gaps > int(onward.sum()) / 2:
+        low, high = float(steps[onward].min()), float(steps[onward].max())
+        raise ValueError(
+            f"{path}: steps of time from {low:.4g} to {high:.4g} s: resample to one sampling time"
+        )
+    if gaps:
+        warnings.warn(
+            f"{path}: {gaps} steps of time are not {dt:.4g} s to within a tenth: a new episode "
+            "begins after each",
+            stacklevel=4,
+        )
+    return dt, joined & even
+
+
+def _nested(values: Any) -> dict[str, Any]:
+    """Observations of an episode as GymEnv names them."""
+    if isinstance(values, Mapping):
+        return {
+            key: _nested(value) if isinstance(value, Mapping) else torch.from_numpy(np.array(value))
+            for key, value in values.items()
+        }
+    if not isinstance(values, np.ndarray):
+        raise TypeError(
+            f"the dataset has observations of type {type(values).__name__}: arrays or "
+            "dictionaries of them can be read"
+        )
+    return {"observation": torch.from_numpy(np.array(values))}
+
+
+def _step(
+    seen: TensorDict,
+    following: TensorDict,
+    action: Tensor,
+    trajectory: Tensor,
+    flags: Mapping[str, Tensor],
+    reward: Tensor | None = None,
+) -> TensorDict:
+    """One tensordict of what an environment says before and after a step."""
+    after = {**flags, "done": flags["terminated"] | flags["truncated"]}
+    following.update(after if reward is None else {**after, "reward": reward})
+    before = {name: torch.zeros_like(value) for name, value in after.items()}
+    collector = {"traj_ids": trajectory}
+    return seen.update({"action": action, **before, "next": following, "collector": collector})
+
+
+def _named(data: TensorDict) -> TensorDict:
+    """Time is what collectors call the last dimension."""
+    data.names = ["time"]
+    return data

@@ -1,0 +1,330 @@
+"""Transitions to fit a model to, out of data as TorchRL makes them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import torch
+from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import ReplayBuffer
+
+Data: TypeAlias = TensorDictBase | ReplayBuffer | Sequence[TensorDictBase]
+
+# Shorter pieces of a long trajectory would hold no open loop of 50 steps.
+_PIECE = 100
+
+_TRAJECTORY_IDS: tuple[NestedKey, ...] = (("collector", "traj_ids"), "traj_ids")
+_PADDING: tuple[NestedKey, ...] = (("collector", "mask"), "mask")
+_ENDS = ("done", "terminated", "truncated")
+
+
+@dataclass
+class Transitions:
+    """What there is to train and to validate on.
+
+    Attributes:
+        data: ``observation``, ``action``, ``("next", "observation")``, batch size ``[N]``, in the
+            order in which they were stored.
+        validation: which are kept out of training, ``(N,)``, bool.
+        joined: which are continued by the next row, ``(N,)``, bool.
+        dropped: rows left out since they are no transitions of the system: values that are not
+            finite, steps across a reset.
+    """
+
+    data: TensorDict
+    validation: Tensor
+    joined: Tensor
+    dropped: int
+
+
+def read_transitions(
+    data: Data,
+    observation_key: NestedKey = "observation",
+    action_key: NestedKey = "action",
+    validation_fraction: float = 0.1,
+    seed: int = 0,
+    dtype: torch.dtype | None = None,
+    device: torch.device | None = None,
+) -> Transitions:
+    """Transitions of a tensordict or buffer, what is no transition left out, and their split.
+
+    Two rows belong to one trajectory where the second starts with the observation that the
+    first ended with, no flag says that an episode ended between them, and ``traj_ids``, if there
+    are any, are equal. Left out are
+
+    - padding, told by the mask that ``split_trajectories`` of TorchRL writes, and steps of
+      an environment that was done before them;
+    - rows with an entry that is not finite, with a warning that counts them;
+    - steps across a reset, with a warning: where an environment that resets itself reports the
+      first observation of the new episode as the last one of the old. The row after it is left
+      out too, since some such environments spend a step on the reset.
+
+    Rows with a true flag ``validation`` are kept out of training. Without one, whole
+    trajectories are, drawn by ``seed`` until they hold ``validation_fraction`` of all rows;
+    trajectories longer than that are cut into pieces first.
+
+    Args:
+        data: a tensordict with any batch size, time last (or called ``"time"``), several of them,
+            or a replay buffer.
+        observation_key: of the observation ``(..., n)``; ``("next", observation_key)`` is the one
+            that followed.
+        action_key: of the action ``(..., m)``.
+        validation_fraction: share of rows kept out of training, in (0, 1).
+        seed: of the draw.
+        dtype: of the result; that of the data if ``None``.
+        device: of the result; that of the data if ``None``.
+
+    Raises:
+        KeyError: if the data lack one of the keys.
+        TypeError: for other data.
+        ValueError: if shapes do not fit.
+    """
+    read: list[TensorDict] = []
+    trajectories = 0
+    for part in _parts(data):
+        one = _read(_time_last(part), observation_key, action_key, dtype, device)
+        one["trajectory"] += trajectories
+        trajectories += len(one)
+        read.append(one)
+    if not read:
+        return _nothing()
+    rows: TensorDictBase = TensorDict.cat(read)
+    keep = rows["real"] & _is_transition(rows, (observation_key, action_key))
+    kept = keep.nonzero().squeeze(-1)
+    joined = rows["joined"][kept]
+    joined[:-1] &= kept.diff() == 1
+    joined[-1:] = False
+    rows, dropped = rows[kept], int(rows["real"].sum()) - len(kept)
+    held_out = rows["validation"]
+    if not held_out.any():
+        held_out = _hold_out(rows["trajectory"], validation_fraction, seed)
+    return Transitions(rows.select("observation", "action", "next"), held_out, joined, dropped)
+
+
+def split_validation(
+    buffer: ReplayBuffer, purpose: str, items: str, setting: str
+) -> tuple[TensorDictBase, TensorDictBase]:
+    """What there is to train on, and what its flag ``validation`` ``(N,)`` keeps out of it.
+
+    Args:
+        buffer: the items.
+        purpose: what they are for, for the error.
+        items: what they are called there.
+        setting: the one that says how many are kept out.
+
+    Raises:
+        ValueError: if there is nothing to train or to validate on.
+    """
+    empty = TensorDict({"validation": torch.zeros(0, dtype=torch.bool)}, batch_size=[0])
+    data = buffer[:] if len(buffer) else empty
+    held_out = data["validation"].reshape(-1)
+    return two_parts(data, held_out, purpose, items, setting)
+
+
+def two_parts(
+    data: TensorDictBase, held_out: Tensor, purpose: str, items: str, setting: str
+) -> tuple[TensorDictBase, TensorDictBase]:
+    """As :func:`split_validation`, of items ``[N]`` and what is kept out of training ``(N,)``."""
+    train, validation = data[~held_out], data[held_out]
+    if train.shape[0] == 0 or validation.shape[0] == 0:
+        raise ValueError(
+            f"cannot {purpose}: {train.shape[0]} training and {validation.shape[0]} validation "
+            f"{items}; collect more data or change {setting}"
+        )
+    return train, validation
+
+
+def _parts(data: Data) -> list[TensorDictBase]:
+    if isinstance(data, ReplayBuffer):
+        data = data[:] if len(data) else []
+        if not len(data):
+            return []
+    parts = [data] if isinstance(data, TensorDictBase) else list(data)
+    for part in parts:
+        if not isinstance(part, TensorDictBase):
+            raise TypeError(
+                "data must be a tensordict, several of them or a ReplayBuffer of tensordicts, got "
+                f"{type(part).__name__}"
+            )
+        if not part.ndim:
+            raise ValueError("data have batch size []: give transitions with a batch size [N]")
+    return parts
+
+
+def _time_last(data: TensorDictBase) -> TensorDictBase:
+    """Collectors name the dimension of time; where it is not the last one, it becomes that."""
+    names = data.names if data._has_names() else []
+    if "time" in names[:-1]:
+        data = data.transpose(names.index("time"), data.ndim - 1)
+    return data
+
+
+def _read(
+    data: TensorDictBase,
+    observation_key: NestedKey,
+    action_key: NestedKey,
+    dtype: torch.dtype | None,
+    device: torch.device | None,
+) -> TensorDict:
+    """What is needed of a tensordict, flat, and what is known of each row."""
+    shape, steps = data.shape, data.shape[-1]
+    next_key = _after(observation_key)
+
+    def vectors(key: NestedKey, option: str) -> Tensor:
+        values = _entry(data, key, option).detach()
+        if values.ndim != data.ndim + 1 or not values.shape[-1]:
+            raise ValueError(
+                f"{_name(key)} has shape {list(values.shape)} for a batch size of {list(shape)}, "
+                f"expected {[*shape, 'n']}: one vector per transition"
+            )
+        return values.reshape(-1, values.shape[-1]).to(
+            device=device, dtype=dtype or torch.get_default_dtype()
+        )
+
+    observation = vectors(observation_key, "observation_key")
+    following = vectors(next_key, "observation_key")
+    action = vectors(action_key, "action_key")
+    if observation.shape != following.shape:
+        raise ValueError(
+            f"{_name(observation_key)} has {observation.shape[-1]} entries, {_name(next_key)} "
+            f"{following.shape[-1]}: they must be observations of one kind"
+        )
+    here = observation.device
+
+    def flag(*keys: NestedKey) -> Tensor | None:
+        found = [value for key in keys if (value := data.get(key, None)) is not None]
+        if not found:
+            return None
+        flat = [value.reshape(data.numel(), -1).bool().any(-1).to(here) for value in found]
+        return torch.stack(flat).any(0)
+
+    none = torch.zeros(len(observation), dtype=torch.bool, device=here)
+    ends = flag(*(("next", name) for name in _ENDS))
+    before = flag(*_ENDS)
+    if ends is None:
+        ends, before = before if before is not None else none, none
+    mask, first, held_out = flag(*_PADDING), flag("is_init"), flag("validation")
+    ids = _trajectory_ids(data, here)
+    # A row of a batch is followed by no other, nor is the last one.
+    meets = none.clone()
+    meets[:-1] = (following[:-1] == observation[1:]).all(-1)
+    meets &= (torch.arange(len(meets), device=here) + 1) % max(steps, 1) != 0
+    told = ids is not None or first is not None
+    goes_on = ~none if told else none.clone()
+    if ids is not None:
+        goes_on[:-1] &= ids[:-1] == ids[1:]
+    if first is not None:
+        goes_on[:-1] &= ~first[1:]
+    real = ~none if mask is None else mask
+    if before is not None:
+        real = real & ~before
+    # An episode ended, and the next one starts where it did: no plant does that.
+    across = meets & ends & ~goes_on & real
+    spent = none.clone()
+    spent[1:] = across[:-1]
+    joined = meets & ~ends
+    if told:
+        joined &= goes_on
+    starts = ~none
+    starts[1:] = ~joined[:-1]
+    trajectory = starts.cumsum(0) - 1
+    if ids is not None:
+        trajectory = ids.unique(return_inverse=True)[1]
+    return TensorDict(
+        {
+            "observation": observation,
+            "action": action,
+            "next": {"observation": following},
+            "joined": joined,
+            "real": real,
+            "reset": (across | spent) & real,
+            "trajectory": trajectory,
+            "validation": none if held_out is None else held_out,
+        },
+        batch_size=[len(observation)],
+    )
+
+
+def _entry(data: TensorDictBase, key: NestedKey, option: str) -> Tensor:
+    """What stands under a key, numbers."""
+    value = data.get(key, None)
+    if value is None:
+        there = ", ".join(sorted(_name(one) for one in data.keys(True, True)))
+        raise KeyError(f"the data have no {_name(key)}, only {there}: name it by {option}")
+    if not isinstance(value, Tensor) or value.is_complex():
+        kind = value.dtype if isinstance(value, Tensor) else type(value).__name__
+        raise ValueError(f"{_name(key)} is {kind}, expected a tensor of real numbers")
+    return value
+
+
+def _after(key: NestedKey) -> NestedKey:
+    return unravel_key(("next", key))
+
+
+def _name(key: NestedKey) -> str:
+    return repr(unravel_key(key))
+
+
+def _trajectory_ids(data: TensorDictBase, device: torch.device) -> Tensor | None:
+    for key in _TRAJECTORY_IDS:
+        if (value := data.get(key, None)) is not None:
+            return value.reshape(-1).long().to(device)
+    return None
+
+
+def _is_transition(rows: TensorDictBase, keys: tuple[NestedKey, NestedKey]) -> Tensor:
+    """Which rows are transitions of the system; warnings count the others."""
+    real, count = rows["real"], int(rows["real"].sum())
+    names = {"observation": keys[0], "action": keys[1], ("next", "observation"): _after(keys[0])}
+    finite = torch.ones_like(real)
+    culprits = []
+    for key, name in names.items():
+        good = rows[key].isfinite().all(-1)
+        finite &= good
+        if broken := int((real & ~good).sum()):
+            culprits.append(f"{broken} in {_name(name)}")
+    if culprits:
+        warnings.warn(
+            f"dropped {int((real & ~finite).sum())} of {count} transitions with values that are "
+            f"not finite: {', '.join(culprits)}",
+            stacklevel=4,
+        )
+    across = real & finite & rows["reset"]
+    if across.any():
+        warnings.warn(
+            f"dropped {int(across.sum())} of {count} transitions at resets: "
+            f"{_name(_after(keys[0]))} of an ended episode is the observation that the next one "
+            "starts from, as an environment reports it that resets itself",
+            stacklevel=4,
+        )
+    return finite & ~rows["reset"]
+
+
+def _nothing() -> Transitions:
+    none = torch.zeros(0, dtype=torch.bool)
+    return Transitions(TensorDict(batch_size=[0]), none, none, 0)
+
+
+def _hold_out(groups: Tensor, fraction: float, seed: int) -> Tensor:
+    """Which rows are kept out of training, ``(N,)``, whole groups of them."""
+    count = len(groups)
+    wanted = max(1, min(round(fraction * count), count - 1))
+    groups, sizes = groups.unique(return_inverse=True, return_counts=True)[1:]
+    if count and int(sizes.max()) > wanted:
+        order = groups.argsort(stable=True)
+        rank = torch.arange(count, device=groups.device)
+        rank[order] = rank - (sizes.cumsum(0) - sizes)[groups[order]]
+        piece = max(1, min(wanted, count - wanted, max(_PIECE, wanted // 5)))
+        pieces = groups * (count // piece + 1) + rank // piece
+        groups, sizes = pieces.unique(return_inverse=True, return_counts=True)[1:]
+    generator = torch.Generator().manual_seed(seed)
+    order = torch.randperm(len(sizes), generator=generator).to(groups.device)
+    before = sizes[order].cumsum(0) - sizes[order]
+    # Never all of them.
+    drawn = order[before < wanted][: max(0, len(sizes) - 1)]
+    return torch.isin(groups, drawn)

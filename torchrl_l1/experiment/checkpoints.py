@@ -1,0 +1,90 @@
+"""Checkpoints: read with every byte checked, and refused in one line if anything is wrong."""
+
+from __future__ import annotations
+
+import pickle
+import warnings
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchrl_l1.algorithms import Algorithm
+from torchrl_l1.experiment.errors import RunDirectoryError
+
+_ENTRIES = {"algorithm": dict, "metrics": list, "timings": list}
+
+
+def read_checkpoint(file: Path) -> dict[str, Any]:
+    """A checkpoint as ``torch.load`` gives it, with the checksums of all its parts compared.
+
+    Only tensors and plain values are read: no code of the file's is run.
+
+    Raises:
+        RunDirectoryError: naming the file and what is wrong with it.
+    """
+    try:
+        if not file.is_file():
+            raise ValueError("it is no file")
+        if file.stat().st_size == 0:
+            raise ValueError("it is empty")
+        if not zipfile.is_zipfile(file):
+            raise ValueError("it is cut off, or no checkpoint at all")
+        # torch itself compares no checksums when it reads.
+        with zipfile.ZipFile(file) as archive:
+            broken = archive.testzip()
+        if broken is not None:
+            raise ValueError(f"{broken} in it is damaged")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            state = torch.load(file, weights_only=True, map_location="cpu")
+        if not isinstance(state, dict):
+            raise ValueError(f"it holds a {type(state).__name__}, no checkpoint")
+        for name, kind in _ENTRIES.items():
+            if not isinstance(state.get(name), kind):
+                raise ValueError(f"it has no {name}")
+        if len(state["metrics"]) != len(state["timings"]) or not state["metrics"]:
+            raise ValueError("its tables do not fit each other")
+        if not all(isinstance(row, dict) for row in (*state["metrics"], *state["timings"])):
+            raise ValueError("its tables hold no rows")
+    except pickle.UnpicklingError as error:
+        raise RunDirectoryError(
+            f"{file} cannot be read: it holds more than tensors and values; that is not run"
+        ) from error
+    # Damage takes any form: what zipfile, pickle and torch raise of it has no common class.
+    except Exception as error:
+        why = " ".join(str(error).split())[:200] or type(error).__name__
+        raise RunDirectoryError(f"{file} cannot be read: {why}") from error
+    return state
+
+
+def checkpoint_of(
+    state: dict[str, Any],
+    rows: list[dict[str, Any]],
+    timings: list[dict[str, Any]],
+    settings: Mapping[str, Any],
+) -> dict[str, Any]:
+    """What is kept of a run: the algorithm's state, its tables, and what they were made with."""
+    return {
+        "algorithm": state,
+        "metrics": rows,
+        "timings": timings,
+        "settings": dict(settings),
+        "torch": str(torch.__version__),
+    }
+
+
+def load_state(algorithm: Algorithm, state: dict[str, Any], file: Path) -> None:
+    """Continue from the state in a checkpoint.
+
+    Raises:
+        RunDirectoryError: if it is of another algorithm or of other sizes.
+    """
+    try:
+        algorithm.load_state_dict(state)
+    # Of a foreign state anything may be missing.
+    except Exception as error:
+        why = " ".join(str(error).split())[:200]
+        raise RunDirectoryError(f"{file} does not fit the run: {why}") from error

@@ -1,0 +1,244 @@
+"""Files: replaced in one step, locked, named within bounds, and never through somebody's link."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml  # type: ignore[import-untyped]
+from filelock import lock_descriptor, unlock_descriptor
+
+from torchrl_l1.experiment.errors import RunDirectoryError
+
+LONGEST_NAME = 120
+"""Characters of a name that is made from settings; file systems take 255 bytes, some 143."""
+
+# File systems take these, so the directories of older runs are found again.
+_LONGEST_OVERRIDES = 230
+_DIGEST = 10
+
+# A recipe has a few hundred entries; what aliases make of a small file may not fit into memory.
+_MOST_YAML_BYTES, _MOST_YAML_ENTRIES = 500_000, 50_000
+
+# Links are followed where a system lacks these, as Windows does, where few may make any.
+_NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
+
+
+def digest(text: str | bytes, length: int = 16) -> str:
+    """The first hexadecimal digits of a text's SHA-256."""
+    content = text.encode() if isinstance(text, str) else text
+    return hashlib.sha256(content).hexdigest()[:length]
+
+
+def bounded(name: str, longest: int = LONGEST_NAME) -> str:
+    """A name that a file system takes: one that is too long is cut and ends in its digest.
+
+    Examples:
+        >>> bounded("by_label_half_cheetah")
+        'by_label_half_cheetah'
+        >>> bounded("by_" + 100 * "key_", longest=24)
+        'by_key_key_ke_f5d1892ed6'
+    """
+    if len(name.encode()) <= longest:
+        return name
+    kept = name.encode()[: longest - _DIGEST - 1].decode(errors="ignore")
+    return f"{kept}_{digest(name, _DIGEST)}"
+
+
+def bounded_overrides(dirname: str) -> str:
+    """Hydra's name for a list of overrides, with the shortest of them and a digest if it is long.
+
+    Examples:
+        >>> bounded_overrides("l1=off,noise=action")
+        'l1=off,noise=action'
+    """
+    if len(dirname.encode()) <= _LONGEST_OVERRIDES:
+        return dirname
+    parts = re.split(r",(?=[\w+~][\w.@/+~-]*=)", dirname)
+    kept: set[int] = set()
+    length = 0
+    for index in sorted(range(len(parts)), key=lambda index: len(parts[index])):
+        length += len(parts[index].encode()) + 1
+        if length > LONGEST_NAME - _DIGEST:
+            break
+        kept.add(index)
+    shown = [part for index, part in enumerate(parts) if index in kept]
+    return ",".join([*shown, digest(dirname, _DIGEST)])
+
+
+def refuse_link(path: Path) -> None:
+    """Make sure that a file or folder of a run directory is not a symbolic link.
+
+    Raises:
+        RunDirectoryError: if it is one: what would be written or deleted lies elsewhere.
+    """
+    if path.is_symlink():
+        raise RunDirectoryError(
+            f"{path} is a symbolic link, which is not followed for writing; remove the link"
+        )
+
+
+@contextmanager
+def locked(file: Path, mode: str = "a") -> Iterator[bool]:
+    """Lock a file for as long as the block lasts, or say that another process has.
+
+    The lock is this process's, not its children's, and the system frees it when the process ends,
+    however it does.
+
+    Args:
+        file: the file; what is in it does not matter.
+        mode: how it is opened; by default it is made where there is none.
+
+    Yields:
+        whether the lock is ours.
+
+    Raises:
+        RunDirectoryError: if the file is a link, or something that is no file.
+    """
+    refuse_link(file)
+    if file.exists() and not file.is_file():
+        raise RunDirectoryError(f"{file} is in the way of a file; remove it")
+
+    def opener(path: str, flags: int) -> int:
+        return os.open(path, flags | _NO_FOLLOW, 0o666)
+
+    with open(file, mode, encoding="utf-8", opener=opener) as handle:
+        ours = lock_descriptor(handle.fileno(), blocking=False)
+        try:
+            yield ours
+        finally:
+            if ours:
+                unlock_descriptor(handle.fileno())
+
+
+def table_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A table as CSV; columns in order of first appearance."""
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def write_table(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write a whole CSV atomically; columns in order of first appearance."""
+    write_atomically(file, table_text(rows))
+
+
+def write_atomically(file: Path, content: str | bytes, keep: Path | None = None) -> None:
+    """Replace a file in one step.
+
+    The target, and what an earlier attempt may have left beside it, are replaced where they are
+    links: nothing is written through them.
+
+    Args:
+        file: the file.
+        content: all of it.
+        keep: where the file stays that is replaced; there is one or the other at any moment.
+
+    Raises:
+        OSError: with the name of the file, which is as it was.
+    """
+    temporary = file.with_name(file.name + ".tmp")
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_FOLLOW | getattr(os, "O_BINARY", 0)
+    try:
+        temporary.unlink(missing_ok=True)
+        with os.fdopen(os.open(temporary, flags, 0o666), "wb") as handle:
+            handle.write(content.encode() if isinstance(content, str) else content)
+            handle.flush()
+            os.fsync(handle.fileno())
+        if keep is not None and file.exists():
+            _keep(file, keep)
+        os.replace(temporary, file)
+    except OSError as error:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise type(error)(error.errno, error.strerror, str(file)) from error
+
+
+def _keep(file: Path, at: Path) -> None:
+    second = at.with_name(at.name + ".tmp")
+    second.unlink(missing_ok=True)
+    try:
+        os.link(file, second)
+    except OSError:  # a file system without hard links
+        os.replace(file, at)
+    else:
+        os.replace(second, at)
+
+
+def saved(state: object) -> bytes:
+    """What ``torch.save`` writes of something."""
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    return buffer.getvalue()
+
+
+def save_atomically(file: Path, state: object) -> None:
+    """Replace a ``torch.save`` file in one step."""
+    write_atomically(file, saved(state))
+
+
+def read_text(file: Path, most_bytes: int | None = None) -> str:
+    """The text of a regular file: a pipe in its place would be waited for for ever.
+
+    Raises:
+        ValueError: if it is no regular file, too long, or no UTF-8.
+        OSError: if it cannot be read.
+    """
+    if not file.is_file():
+        if not file.exists():
+            raise FileNotFoundError(2, "No such file or directory", str(file))
+        raise ValueError(f"{file} is no file")
+    if most_bytes is not None and file.stat().st_size > most_bytes:
+        raise ValueError(f"{file} is longer than {most_bytes} bytes")
+    return file.read_text(encoding="utf-8")
+
+
+def yaml_text(file: Path) -> str:
+    """The text of a YAML file that is small, whatever its aliases make of it.
+
+    Raises:
+        ValueError: if it is not, or no YAML.
+        OSError: if it cannot be read.
+    """
+    text = read_text(file, _MOST_YAML_BYTES)
+    if "*" in text and "&" in text:
+        try:
+            if _entries(yaml.compose(text, yaml.SafeLoader), {}) > _MOST_YAML_ENTRIES:
+                raise ValueError(f"{file} has aliases that make it too large")
+        except (yaml.YAMLError, RecursionError) as error:
+            raise ValueError(f"{file} is not valid YAML: {problem(error)}") from error
+    return text
+
+
+def problem(error: BaseException) -> str:
+    """What is wrong with a YAML text, in one line."""
+    if isinstance(error, RecursionError):
+        return "it is nested too deeply"
+    mark = getattr(error, "problem_mark", None)
+    words = getattr(error, "problem", None) or str(error)
+    place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark is not None else ""
+    return place + " ".join(str(words).split())
+
+
+def _entries(node: Any, known: dict[int, int]) -> int:
+    """Nodes below one, each as often as it is named."""
+    if id(node) not in known:
+        known[id(node)] = _MOST_YAML_ENTRIES + 1  # while it is counted: it is part of itself
+        parts: list[Any] = []
+        if isinstance(node, yaml.SequenceNode):
+            parts = node.value
+        elif isinstance(node, yaml.MappingNode):
+            parts = [part for pair in node.value for part in pair]
+        known[id(node)] = 1 + sum(_entries(part, known) for part in parts)
+    return known[id(node)]
