@@ -147,6 +147,7 @@ class L1Config:
             raise ValueError(f"project must be True or False, got {self.project!r}")
         self._check_filter()
         self._check_kalman()
+        object.__setattr__(self, "max_error", _as_number(self.max_error))
         if not (_is_real(self.max_error) and self.max_error > 0):
             raise ValueError(f"max_error must be a positive number, got {self.max_error!r}")
         self._check_predictor()
