@@ -13,7 +13,6 @@ from types import ModuleType
 from typing import Any
 
 from torchrl_l1.experiment.settings import SCHEMAS
-from torchrl_l1.report.page import markdown
 
 PACKAGES = (
     "control",

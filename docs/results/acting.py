@@ -21,8 +21,8 @@ from torch import Tensor
 from torchrl_l1.algorithms.collection import episode_returns
 from torchrl_l1.control import kalman
 from torchrl_l1.experiment.evaluate import TrainedRun, load_run, make_collection
-from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.experiment.files import write_table
+from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.report.page import markdown
 
 HERE = Path(__file__).parent
