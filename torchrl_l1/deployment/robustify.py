@@ -33,8 +33,8 @@ from torchrl_l1.deployment.learning import (
 from torchrl_l1.deployment.policies import Policy, load_policy
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, fit_dynamics
 from torchrl_l1.experiment.evaluate import load_run
+from torchrl_l1.experiment.files import write_atomically
 from torchrl_l1.experiment.l1_options import OFF, closest_option, l1_option
-from torchrl_l1.experiment.run_directory import write_atomically
 from torchrl_l1.experiment.settings import l1_config
 
 PRESETS = ("robust", "paper")
