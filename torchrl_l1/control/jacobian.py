@@ -366,7 +366,7 @@ class ActionJacobian:
     def _reverse_mode(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Value and Jacobian, one backward pass per state; the rows of a batch are independent."""
         if _is_traced():
-            value, pull_back = torch.func.vjp(lambda u: self.value(observation, u), action)
+            value, pull_back, *_ = torch.func.vjp(lambda u: self.value(observation, u), action)
             basis = torch.eye(value.shape[-1], dtype=value.dtype, device=value.device)
             rows = [pull_back(row.expand_as(value))[0] for row in basis.unbind(0)]
             return value, torch.stack(rows, -2)

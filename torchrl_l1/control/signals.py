@@ -42,8 +42,8 @@ def project(config: L1Config, sigma_m: Tensor) -> Tensor:
     if bound is None:
         return sigma_m
     if isinstance(bound, tuple):
-        limit = like(sigma_m, bound)
-        return torch.clamp(sigma_m, -limit, limit)  # type: ignore[operator]
+        limit = cast(Tensor, like(sigma_m, bound))
+        return torch.clamp(sigma_m, -limit, limit)
     number = cast(float, _number(sigma_m, bound))
     return torch.clamp(sigma_m, -number, number)
 
@@ -90,8 +90,8 @@ def narrow_entries(entries: Entries, dtype: torch.dtype) -> Entries:
     """:func:`narrow` of each entry of a state or of diagnostics."""
     if dtype not in _HALF:
         return entries
-    values = (None if value is None else narrow(value, dtype) for value in entries)
-    return type(entries)(*values)
+    values = [None if value is None else narrow(value, dtype) for value in entries]
+    return type(entries)(*cast(list[Tensor], values))
 
 
 def credible(config: L1Config, dtype: torch.dtype, x_err: Tensor, *states: Tensor) -> Tensor:
