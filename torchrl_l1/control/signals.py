@@ -91,7 +91,7 @@ def narrow_entries(entries: Entries, dtype: torch.dtype) -> Entries:
     if dtype not in _HALF:
         return entries
     values = [None if value is None else narrow(value, dtype) for value in entries]
-    return type(entries)(*cast(list[Tensor], values))
+    return type(entries)(*values)  # type: ignore[arg-type]
 
 
 def credible(config: L1Config, dtype: torch.dtype, x_err: Tensor, *states: Tensor) -> Tensor:
