@@ -478,3 +478,15 @@ def test_replay_data_hold_the_policys_action(model, actor):
     torch.testing.assert_close(stored["action"], actor(stored.clone())["action"])
     executed = stored["next", "l1", "u_exec"]
     assert not torch.allclose(executed, stored["action"])
+
+
+def test_environments_that_are_done_wait_for_the_others(model):
+    # The own environment goes on with all rows, whatever it is asked.
+    falling = replace(TASKS["inverted_pendulum"], terminated=lambda o: o[..., 1].abs() > 0.2)
+    env = with_l1(BatchedMujocoEnv(falling, num_envs=2, seed=0), model, max_steps=None)
+    push = torch.tensor([[0.2], [1.5]])
+    actor = TensorDictModule(lambda x: push + 0.1 * x[..., :1], ["observation"], ["action"])
+    data = env.rollout(60, actor, break_when_any_done=False, break_when_all_done=True)
+    first, second = (int(row.nonzero()[0]) for row in data["next", "done"].squeeze(-1))
+    assert second < first == data.shape[1] - 1
+    assert torch.equal(data["next", "l1", "q"][1, second], data["next", "l1", "q"][1, -1])

@@ -243,11 +243,12 @@ class L1Transform(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         following = tensordict.get(self._pending)
-        self._seal(following, next_tensordict.get(self.observation_key))
         stepped = tensordict.get("_step", None)
         if stepped is not None:
             previous = tensordict.get(self.key).select(*following.keys(), strict=False)
             following = following.where(stepped.reshape(following.batch_size), previous, pad=0)
+        # Environments may go on without being asked: the seal is on what came out.
+        self._seal(following, next_tensordict.get(self.observation_key))
         return next_tensordict.set(self.key, following)
 
     def _reset(
