@@ -228,7 +228,7 @@ def _unknown(node: DictConfig, prefix: str, known: list[str]) -> list[str]:
     named = {part.name for part in fields(kind)} if is_dataclass(kind) else None
     found = []
     known += [prefix + name for name in named or ()]
-    for key in node:
+    for key in map(str, node):
         if named is not None and key not in named and not (key == "hydra" and not prefix):
             found.append(f"{prefix}{key}")
         elif isinstance(part := node._get_node(key), DictConfig) and key != "hydra":
