@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -145,7 +144,7 @@ def test_a_signal_ends_the_run_in_order(
 
     def complete_and_send(self: METRPO, *arguments: Any) -> Any:
         if self.iteration == 1:
-            os.kill(os.getpid(), number)
+            signal.raise_signal(number)
         return complete(self, *arguments)
 
     monkeypatch.setattr(METRPO, "complete", complete_and_send)
@@ -162,7 +161,7 @@ def test_a_second_signal_is_not_caught() -> None:
     seen = []
     with pytest.raises(SystemExit), orderly_end():
         try:
-            os.kill(os.getpid(), signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)
         finally:
             seen.append(signal.getsignal(signal.SIGTERM))
     assert seen == [signal.SIG_DFL]
@@ -175,7 +174,7 @@ def test_a_warning_lets_the_iteration_be_finished(
     fit = ModelLearning.fit
 
     def send_and_fit(self: Any, *arguments: Any) -> Any:
-        os.kill(os.getpid(), signal.SIGUSR1)
+        signal.raise_signal(signal.SIGUSR1)
         return fit(self, *arguments)
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as exit_info, orderly_end():

@@ -25,6 +25,7 @@ USER_ERRORS = (
     HydraException,
     KeyError,
     OSError,
+    OverflowError,
     OmegaConfBaseException,
     RecipeError,
     RunDirectoryError,

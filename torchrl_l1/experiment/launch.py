@@ -119,7 +119,7 @@ def _check(recipe: Path, overrides: Sequence[str], sweeps: bool, trusted: bool) 
             # Without a schema no override has a place: that is what is wrong then.
             check_known(_composed(recipe.stem, settings))
         raise RecipeError(message(error)) from error
-    except (yaml.YAMLError, RecursionError) as error:
+    except (yaml.YAMLError, RecursionError, OverflowError, TypeError) as error:
         raise RecipeError(f"{recipe}, or what it includes: {problem(error)}") from error
     check_known(config)
 
