@@ -24,12 +24,12 @@ from torchrl_l1.control.layout import (
     Layout,
     action_bounds,
     advance,
+    as_action_jacobian,
     declared_dimension,
     required_entry,
 )
 from torchrl_l1.control.pipeline import (
     Settings,
-    as_model,
     carry,
     check_time_step,
     leaf_spec,
@@ -284,8 +284,13 @@ class L1Controller(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self._environment = _Environment(Settings("L1Controller", config, dt, settings))
-        self.model = as_model(
-            dynamics, observation_key, action_key, predicts, out_key, ensemble_dim
+        self.model = as_action_jacobian(
+            dynamics,
+            observation_key,
+            action_key,
+            predicts,
+            out_key=out_key,
+            ensemble_dim=ensemble_dim,
         )
         self.observation_key = observation_key
         self.action_key = action_key

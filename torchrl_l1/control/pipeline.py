@@ -22,8 +22,6 @@ from torchrl.envs.transforms import (
 )
 
 from torchrl_l1.control.config import L1Config, Scalars
-from torchrl_l1.control.jacobian import ActionJacobian, Predicts
-from torchrl_l1.control.layout import Dynamics, as_action_jacobian
 
 # Wrappers of Gymnasium that repeat an action keep the number under one of these, by custom.
 _REPEATS = ("_skip", "skip", "_frame_skip", "frame_skip", "action_repeat")
@@ -300,29 +298,6 @@ class Settings:
 
 
 _SHORT = 1e-6
-
-
-def as_model(
-    dynamics: Dynamics,
-    observation_key: NestedKey,
-    action_key: NestedKey,
-    predicts: Predicts | None,
-    out_key: NestedKey | None,
-    ensemble_dim: int | None,
-) -> ActionJacobian:
-    """The dynamics as an :class:`ActionJacobian`, which is returned as it is."""
-    if out_key is None and ensemble_dim is None:
-        return as_action_jacobian(dynamics, observation_key, action_key, predicts)
-    if isinstance(dynamics, ActionJacobian):
-        raise ValueError("out_key and ensemble_dim belong to the ActionJacobian: give them there")
-    return ActionJacobian(
-        dynamics,
-        observation_key=observation_key,
-        action_key=action_key,
-        out_key=out_key,
-        predicts=predicts,
-        ensemble_dim=ensemble_dim,
-    )
 
 
 def leaf_spec(spec: TensorSpec) -> TensorSpec:

@@ -16,10 +16,9 @@ from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control.affine import StepFunction, make_step
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import Predicts
-from torchrl_l1.control.layout import L1_KEY, Dynamics, Layout, advance
+from torchrl_l1.control.layout import L1_KEY, Dynamics, Layout, advance, as_action_jacobian
 from torchrl_l1.control.pipeline import (
     Settings,
-    as_model,
     carry,
     check_order,
     check_time_step,
@@ -117,8 +116,13 @@ class L1Transform(Transform):
     ) -> None:
         super().__init__()
         self._settings = Settings("L1Transform", config, dt, settings)
-        self.model = as_model(
-            dynamics, observation_key, action_key, predicts, out_key, ensemble_dim
+        self.model = as_action_jacobian(
+            dynamics,
+            observation_key,
+            action_key,
+            predicts,
+            out_key=out_key,
+            ensemble_dim=ensemble_dim,
         )
         self.observation_key = unravel_key(observation_key)
         self.action_key = unravel_key(action_key)
