@@ -336,7 +336,7 @@ def test_predictions_of_several_members_under_a_name():
     torch.testing.assert_close(controller(data)["next", "l1", "x_hat"], torch.full((2, 4), 2.2))
     env = make_env(2, L1Transform(module, dt=0.04, **options))
     assert env.rollout(3)["next", "l1", "started"].all()
-    with pytest.raises(ValueError, match="belong to the ActionJacobian"):
+    with pytest.raises(ValueError, match="out_key and ensemble_dim to the ActionJacobian"):
         L1Transform(ActionJacobian(make_model()), dt=0.04, ensemble_dim=0)
 
 
