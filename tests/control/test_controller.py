@@ -330,7 +330,7 @@ def test_predictions_of_several_members_under_a_name():
         ["observation", "action"],
         ["members", "other"],
     )
-    options = {"out_key": "members", "ensemble_dim": 0}
+    options = {"out_key": "members", "ensemble_dim": 0, "predicts": "change"}
     controller = L1Controller(module, CONFIG, observation_dim=4, action_dim=1, **options)
     data = tensordict(controller, observation=torch.ones(2, 4), action=torch.ones(2, 1))
     torch.testing.assert_close(controller(data)["next", "l1", "x_hat"], torch.full((2, 4), 2.2))
