@@ -120,7 +120,9 @@ def test_gymnasiums_own_plants_are_changed():
     assert 0 < speeds[0] < 0.7 * speeds[1]
 
 
-@pytest.mark.parametrize(("env", "name"), [("Pendulum-v1", "mass"), ("InvertedPendulum-v5", "wind")])
+@pytest.mark.parametrize(
+    ("env", "name"), [("Pendulum-v1", "mass"), ("InvertedPendulum-v5", "wind")]
+)
 def test_changes_of_a_plant_that_cannot_be_made_are_refused(env, name):
     with pytest.raises(ValueError, match=f"{name} changes the plant"):
         environment_source(env).several(2, {name: 0.5})
