@@ -2,10 +2,11 @@
 
     python docs/results/robustify.py [FOLDER]
 
-Needs the extra `sb3`. Trains PPO with its default settings on InvertedPendulum-v5, looks at what each policy
-withstands by itself (`robustify/policies.csv` and `.md`), and runs `torchrl-l1 robustify` on one that works
-without a bias and falls with one: `robustify/evaluation.csv`, `.png` and `table.md`. FOLDER, `runs/ppo` if
-none is given, keeps the policies; those that are there are not trained again.
+Needs the extra `sb3`. Trains PPO with its default settings on InvertedPendulum-v5, looks at what
+each policy withstands by itself (`robustify/policies.csv` and `.md`), and runs
+`torchrl-l1 robustify` on one that works without a bias and falls with one:
+`robustify/evaluation.csv`, `.png` and `table.md`. FOLDER, `runs/ppo` if none is given, keeps the
+policies; those that are there are not trained again.
 """
 
 from __future__ import annotations
@@ -99,7 +100,8 @@ def policies_table() -> None:
             ]
             line[f"bias {bias:g}"] = ", ".join(found)
         lines.append(line)
-    words = f"Without L1: median number of steps of {EPISODES} episodes, for each of {len(SEEDS)} seeds."
+    words = f"Without L1: median number of steps of {EPISODES} episodes"
+    words += f", for each of {len(SEEDS)} seeds."
     (HERE / "policies.md").write_text(f"{words}\n\n{markdown(lines)}\n")
 
 

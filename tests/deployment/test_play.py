@@ -40,7 +40,7 @@ def test_films_as_mp4(tmp_path):
 
 
 def test_what_cannot_be_shown_is_refused_at_once(monkeypatch, tmp_path):
-    with pytest.raises(ValueError, match="must end in .mp4 or .gif"):
+    with pytest.raises(ValueError, match="must end in"):
         play.check_film(tmp_path / "film.avi")
     monkeypatch.setattr(play.sys, "platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):

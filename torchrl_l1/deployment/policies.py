@@ -192,6 +192,7 @@ def load_policy(
 
     Raises:
         FileNotFoundError: if there is no such file.
+        RuntimeError: if the weights are not those of the module.
         ValueError: for a source that stands for nothing, a file beside it that changes what the
             policy sees and is not mentioned, or a policy that returns no action.
     """
@@ -206,7 +207,14 @@ def load_policy(
             raise ValueError(
                 f"weights go into a module, and the policy is a {type(found).__name__}"
             )
-        found.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
+        try:
+            stored = torch.load(weights, map_location="cpu", weights_only=True)
+        except pickle.UnpicklingError:
+            raise ValueError(
+                f"{weights} holds more than the tensors of a state dict, which is not loaded, since "
+                "that executes what is in it: save module.state_dict()"
+            ) from None
+        found.load_state_dict(stored)
     if isinstance(found, TensorDictModuleBase):
         return found
     if not callable(found):
