@@ -211,8 +211,8 @@ def load_policy(
             stored = torch.load(weights, map_location="cpu", weights_only=True)
         except pickle.UnpicklingError:
             raise ValueError(
-                f"{weights} holds more than the tensors of a state dict, which is not loaded, since "
-                "that executes what is in it: save module.state_dict()"
+                f"{weights} holds more than the tensors of a state dict, and loading that would "
+                "execute what is in it: save module.state_dict()"
             ) from None
         found.load_state_dict(stored)
     if isinstance(found, TensorDictModuleBase):
