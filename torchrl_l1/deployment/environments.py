@@ -117,7 +117,7 @@ class EnvironmentSource:
             return make_env(self.task, 1, extra_transforms=control, seed=seed, **given)
         return _perturbed(self._changed(given, **options), given, control, seed)
 
-    def _checked(self, disturbances: Mapping[str, float]) -> dict[str, float]:
+    def _checked(self, disturbances: Mapping[str, float]) -> dict[str, Any]:
         for name in disturbances:
             if not self.takes(DISTURBANCES[name]):
                 raise ValueError(
