@@ -10,7 +10,7 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeAlias
 
 import gymnasium
 import mujoco
@@ -42,7 +42,7 @@ from torchrl_l1.envs import (
     make_env,
 )
 
-MakeEnv = str | Task | Callable[[], EnvBase]
+MakeEnv: TypeAlias = str | Task | Callable[[], EnvBase]
 """A name, a task of ours, or a function that makes an environment."""
 
 _FORMS = (

@@ -162,16 +162,16 @@ def export(
                     "export L1 alone (with_policy=False, --without-policy)"
                 ) from error
             raise
-        error = _compare(step, recorded, module, with_policy)
+        worst = _compare(step, recorded, module, with_policy)
     half = config.half_range
     allowed = tolerance * (min(half) if isinstance(half, tuple) else half)
-    if not error <= allowed:
+    if not worst <= allowed:
         raise ValueError(
-            f"{file} differs from the original by up to {error:.3g} action units in {steps} steps, "
+            f"{file} differs from the original by up to {worst:.3g} action units in {steps} steps, "
             f"and {allowed:.3g} are allowed: a policy that draws random numbers, or that is not "
             "made of torch's operations, cannot be exported (see with_policy, --without-policy)"
         )
-    return Exported(file, inputs, outputs, error, steps)
+    return Exported(file, inputs, outputs, worst, steps)
 
 
 def _recorded(

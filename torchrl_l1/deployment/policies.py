@@ -10,7 +10,7 @@ import zipfile
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from torchrl.envs import EnvBase
 from torchrl_l1.deployment.environments import load_attribute, require
 from torchrl_l1.experiment.evaluate import load_run
 
-Policy = str | TensorDictModuleBase | nn.Module | Callable[[Tensor], Any]
+Policy: TypeAlias = str | TensorDictModuleBase | nn.Module | Callable[[Tensor], Any]
 """A source, a TorchRL module, a model of Stable-Baselines3, or a function of the observation."""
 
 NO_NORMALIZATION = "none"
@@ -134,6 +134,11 @@ class StableBaselinesPolicy(nn.Module):
         statistics: mean, variance, epsilon and clipping of VecNormalize.
     """
 
+    low: Tensor
+    high: Tensor
+    mean: Tensor | None
+    deviation: Tensor | None
+
     def __init__(
         self, policy: Any, statistics: tuple[Tensor, Tensor, float, float] | None = None
     ) -> None:
@@ -145,14 +150,15 @@ class StableBaselinesPolicy(nn.Module):
         space = policy.action_space
         self.register_buffer("low", torch.as_tensor(space.low))
         self.register_buffer("high", torch.as_tensor(space.high))
-        mean, variance, self.epsilon, self.clip = statistics or (None, None, 0.0, 0.0)
+        mean, variance, epsilon, self.clip = statistics or (None, None, 0.0, 0.0)
         self.register_buffer("mean", mean)
-        self.register_buffer("variance", variance)
+        deviation = None if variance is None else (variance + epsilon).sqrt()
+        self.register_buffer("deviation", deviation)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Actions ``(N, m)`` for raw observations ``(N, n)``."""
-        if self.mean is not None:
-            scaled = (observation - self.mean) / (self.variance + self.epsilon).sqrt()
+        if self.mean is not None and self.deviation is not None:
+            scaled = (observation - self.mean) / self.deviation
             observation = scaled.clamp(-self.clip, self.clip)
         action = self.policy._predict(observation.to(self.dtype), deterministic=True)
         if self.squashed:
