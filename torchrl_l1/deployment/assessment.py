@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -351,5 +351,7 @@ def _add_recovered(rows: Sequence[Row], episodes: Sequence[Row], names: Sequence
     for row in rows:
         found = returns[cell(row)]
         if row["l1"] not in UNTUNED and ORACLE in found:
-            off, on, oracle = ({_ONLY: found[l1]} for l1 in (OFF, row["l1"], ORACLE))
-            row |= recovery_columns(dict(off), dict(on), dict(oracle))
+            compared: list[dict[Hashable, list[float]]] = [
+                {_ONLY: found[l1]} for l1 in (OFF, row["l1"], ORACLE)
+            ]
+            row |= recovery_columns(*compared)

@@ -204,7 +204,7 @@ def load_policy(
     """
     if normalization is not None and not (isinstance(policy, str) and policy.startswith("sb3:")):
         raise ValueError("normalization belongs to policies of Stable-Baselines3, sb3:FILE.zip")
-    found = _from_source(policy, normalization) if isinstance(policy, str) else policy
+    found: Any = _from_source(policy, normalization) if isinstance(policy, str) else policy
     predicts = getattr(found, "predict", None)
     if callable(predicts) and hasattr(getattr(found, "policy", None), "squash_output"):
         found = StableBaselinesPolicy(found.policy)  # a model of Stable-Baselines3
