@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import pickle
 import warnings
 
 import numpy as np
@@ -59,7 +58,7 @@ def test_actions_stay_within_the_bounds(env):
     [
         (lambda x: torch.zeros(7), "expected an action of width 1"),
         (lambda x: x.no_such_thing, "failed at an observation of width 4"),
-        (3, "an int is no policy|a int is no policy"),
+        (3, "int is no policy"),
         ("nothing", "unknown policy 'nothing'; policies are sb3"),
         ("math:no_such_name", "no 'no_such_name'"),
     ],
@@ -90,7 +89,7 @@ def test_modules_with_the_weights_of_a_state_dict(env, policy_file, tmp_path):
 
 def test_weights_that_are_pickles_of_objects_are_refused(env, policy_file, tmp_path):
     torch.save(torch.nn.Linear(4, 1), tmp_path / "module.pt")
-    with pytest.raises(pickle.UnpicklingError, match="weights_only|Weights only"):
+    with pytest.raises(ValueError, match="more than the tensors of a state dict"):
         load_policy(f"{policy_file}:network", env, weights=str(tmp_path / "module.pt"))
 
 

@@ -80,6 +80,8 @@ def robustify_command(options: argparse.Namespace) -> None:
         noise=options.noise,
         seed=options.seed,
     )
+    # At once: a test that is broken off need not cost the controller.
+    folder = robust.save(output / "controller")
     table = robust.evaluate(
         disturbances or _some_biases(robust),
         episodes=options.episodes,
@@ -87,7 +89,6 @@ def robustify_command(options: argparse.Namespace) -> None:
         seed=options.seed,
     )
     print(f"\n{table.words}\n\n{table}\n")
-    folder = robust.save(output / "controller")
     write_table(output / "evaluation.csv", table.rows)
     write_table(output / "episodes.csv", table.episodes)
     chart = table.plot(output / "evaluation.png")

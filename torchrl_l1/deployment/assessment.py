@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ from torchrl_l1.report.page import markdown
 from torchrl_l1.report.recovery import recovered_text, recovery_columns
 from torchrl_l1.report.style import arm_label, color, fit_scale, grid, legend_below, save
 
-Disturbances = str | Mapping[str, float | Sequence[float]]
+Disturbances: TypeAlias = str | Mapping[str, float | Sequence[float]]
 """Name of a suite, or values of disturbances by name."""
 
 Row = dict[str, Any]
@@ -236,8 +236,8 @@ class Assessment(Sequence[Row]):
             x = [row[name] for row in mine]
             shade = color(3 + index, l1)
             axis.plot(
-                x, [row[f"{what}_median"] for row in mine], "o-", color=shade, markersize=4,
-                label=arm_label(l1), linestyle="--" if l1 == ORACLE else "-",
+                x, [row[f"{what}_median"] for row in mine], "o--" if l1 == ORACLE else "o-",
+                color=shade, markersize=4, label=arm_label(l1),
             )  # fmt: skip
             low, high = ([row[f"{what}_{side}"] for row in mine] for side in ("lowest", "highest"))
             axis.fill_between(x, low, high, color=shade, alpha=0.15, linewidth=0)
@@ -351,4 +351,7 @@ def _add_recovered(rows: Sequence[Row], episodes: Sequence[Row], names: Sequence
     for row in rows:
         found = returns[cell(row)]
         if row["l1"] not in UNTUNED and ORACLE in found:
-            row |= recovery_columns(*({_ONLY: found[l1]} for l1 in (OFF, row["l1"], ORACLE)))
+            compared: list[dict[Hashable, list[float]]] = [
+                {_ONLY: found[l1]} for l1 in (OFF, row["l1"], ORACLE)
+            ]
+            row |= recovery_columns(*compared)

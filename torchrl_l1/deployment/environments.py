@@ -10,7 +10,7 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeAlias
 
 import gymnasium
 import mujoco
@@ -42,7 +42,7 @@ from torchrl_l1.envs import (
     make_env,
 )
 
-MakeEnv = str | Task | Callable[[], EnvBase]
+MakeEnv: TypeAlias = str | Task | Callable[[], EnvBase]
 """A name, a task of ours, or a function that makes an environment."""
 
 _FORMS = (
@@ -117,7 +117,7 @@ class EnvironmentSource:
             return make_env(self.task, 1, extra_transforms=control, seed=seed, **given)
         return _perturbed(self._changed(given, **options), given, control, seed)
 
-    def _checked(self, disturbances: Mapping[str, float]) -> dict[str, float]:
+    def _checked(self, disturbances: Mapping[str, float]) -> dict[str, Any]:
         for name in disturbances:
             if not self.takes(DISTURBANCES[name]):
                 raise ValueError(

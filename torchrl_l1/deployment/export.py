@@ -49,9 +49,11 @@ class ControlledStep(nn.Module):
         config: L1Config,
     ) -> None:
         super().__init__()
-        self.policy, self.config = policy, config
-        # Its weights become constants: torch.export cannot slice the lists of a module's own.
+        self.config = config
+        # Neither is registered, and their weights become constants: tracers walk through the
+        # attributes of what is, and those of TorchRL's actors raise.
         self.jacobian = ActionJacobian(copy.deepcopy(model).requires_grad_(False))
+        self.policies = () if policy is None else (copy.deepcopy(policy).requires_grad_(False),)
         fresh = init([1], model.observation_dim, model.action_dim, config)
         self.fresh = fresh.entries()
 
@@ -62,21 +64,20 @@ class ControlledStep(nn.Module):
             observation: ``(1, n)``.
             inputs: the policy's action ``(1, m)`` if there is no policy, then the state.
         """
-        if self.policy is None:
-            action, *entries = inputs
+        if self.policies:
+            action, entries = self._act(self.policies[0], observation), list(inputs)
         else:
-            action, entries = self._act(observation), list(inputs)
+            action, *entries = inputs
         state = L1State(**dict(zip(self.fresh, entries, strict=True)))
         executed, following, _ = augment(self.config, self.jacobian, state, observation, action)
         return executed, *following.entries().values()
 
-    def _act(self, observation: Tensor) -> Tensor:
-        if isinstance(self.policy, FunctionPolicy):
-            return self.policy.act(observation)
+    def _act(self, policy: TensorDictModuleBase, observation: Tensor) -> Tensor:
+        if isinstance(policy, FunctionPolicy):
+            return policy.act(observation)
         data = TensorDict({"observation": observation}, batch_size=[1])
-        assert self.policy is not None
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            return self.policy(data).get("action")
+            return policy(data).get("action")
 
 
 @dataclass(frozen=True)
@@ -162,16 +163,16 @@ def export(
                     "export L1 alone (with_policy=False, --without-policy)"
                 ) from error
             raise
-        error = _compare(step, recorded, module, with_policy)
+        worst = _compare(step, recorded, module, with_policy)
     half = config.half_range
     allowed = tolerance * (min(half) if isinstance(half, tuple) else half)
-    if not error <= allowed:
+    if not worst <= allowed:
         raise ValueError(
-            f"{file} differs from the original by up to {error:.3g} action units in {steps} steps, "
+            f"{file} differs from the original by up to {worst:.3g} action units in {steps} steps, "
             f"and {allowed:.3g} are allowed: a policy that draws random numbers, or that is not "
             "made of torch's operations, cannot be exported (see with_policy, --without-policy)"
         )
-    return Exported(file, inputs, outputs, error, steps)
+    return Exported(file, inputs, outputs, worst, steps)
 
 
 def _recorded(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -191,7 +192,7 @@ def epsilon_for(
     scale = torch.linalg.vector_norm(model.change_normalizer.std).item()
     low, high = 1e-6 * scale, 1e2 * scale
     for _ in range(3):
-        epsilon = torch.logspace(*torch.tensor([low, high]).log10().tolist(), 16)
+        epsilon = torch.logspace(math.log10(low), math.log10(high), 16)
         rates = switch_rates(model, observation, action, started, epsilon)
         above = int((rates > rate).sum())  # they fall
         low = float(epsilon[max(above - 1, 0)])

@@ -83,7 +83,7 @@ def film(
             f"{source.name or 'the environment'} cannot be drawn: name one of Gymnasium's, of "
             "dm_control's or of ours"
         )
-    options = {} if mujoco_ else {"render_mode": "rgb_array"}
+    options: dict[str, Any] = {} if mujoco_ else {"render_mode": "rgb_array"}
     env = source.single(disturbances, control, **options)
     shown: list[np.ndarray] = []
 
@@ -99,13 +99,10 @@ def film(
         record()  # of an episode of a single step
     ended = bool(data["next", "terminated"].any())
     frames = shown
-    if mujoco_:
-        poses = np.stack(shown)
-        frames = (
-            rollout_frames(source.task, poses, size=size)
-            if source.task is not None
-            else draw_poses(_physics(env)[0], poses, size=size)
-        )
+    if source.task is not None:
+        frames = rollout_frames(source.task, np.stack(shown), size=size)
+    elif (physics := _physics(env)) is not None:
+        frames = draw_poses(physics[0], np.stack(shown), size=size)
     words = "L1 off" if l1 == OFF else f"L1 {l1}"
     env.close()
     return Film(words, frames, float(data["next", "reward"].sum()), ended)

@@ -10,7 +10,7 @@ import zipfile
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from torchrl.envs import EnvBase
 from torchrl_l1.deployment.environments import load_attribute, require
 from torchrl_l1.experiment.evaluate import load_run
 
-Policy = str | TensorDictModuleBase | nn.Module | Callable[[Tensor], Any]
+Policy: TypeAlias = str | TensorDictModuleBase | nn.Module | Callable[[Tensor], Any]
 """A source, a TorchRL module, a model of Stable-Baselines3, or a function of the observation."""
 
 NO_NORMALIZATION = "none"
@@ -134,6 +134,11 @@ class StableBaselinesPolicy(nn.Module):
         statistics: mean, variance, epsilon and clipping of VecNormalize.
     """
 
+    low: Tensor
+    high: Tensor
+    mean: Tensor | None
+    deviation: Tensor | None
+
     def __init__(
         self, policy: Any, statistics: tuple[Tensor, Tensor, float, float] | None = None
     ) -> None:
@@ -145,14 +150,15 @@ class StableBaselinesPolicy(nn.Module):
         space = policy.action_space
         self.register_buffer("low", torch.as_tensor(space.low))
         self.register_buffer("high", torch.as_tensor(space.high))
-        mean, variance, self.epsilon, self.clip = statistics or (None, None, 0.0, 0.0)
+        mean, variance, epsilon, self.clip = statistics or (None, None, 0.0, 0.0)
         self.register_buffer("mean", mean)
-        self.register_buffer("variance", variance)
+        deviation = None if variance is None else (variance + epsilon).sqrt()
+        self.register_buffer("deviation", deviation)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Actions ``(N, m)`` for raw observations ``(N, n)``."""
-        if self.mean is not None:
-            scaled = (observation - self.mean) / (self.variance + self.epsilon).sqrt()
+        if self.mean is not None and self.deviation is not None:
+            scaled = (observation - self.mean) / self.deviation
             observation = scaled.clamp(-self.clip, self.clip)
         action = self.policy._predict(observation.to(self.dtype), deterministic=True)
         if self.squashed:
@@ -192,12 +198,13 @@ def load_policy(
 
     Raises:
         FileNotFoundError: if there is no such file.
+        RuntimeError: if the weights are not those of the module.
         ValueError: for a source that stands for nothing, a file beside it that changes what the
             policy sees and is not mentioned, or a policy that returns no action.
     """
     if normalization is not None and not (isinstance(policy, str) and policy.startswith("sb3:")):
         raise ValueError("normalization belongs to policies of Stable-Baselines3, sb3:FILE.zip")
-    found = _from_source(policy, normalization) if isinstance(policy, str) else policy
+    found: Any = _from_source(policy, normalization) if isinstance(policy, str) else policy
     predicts = getattr(found, "predict", None)
     if callable(predicts) and hasattr(getattr(found, "policy", None), "squash_output"):
         found = StableBaselinesPolicy(found.policy)  # a model of Stable-Baselines3
@@ -206,7 +213,14 @@ def load_policy(
             raise ValueError(
                 f"weights go into a module, and the policy is a {type(found).__name__}"
             )
-        found.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
+        try:
+            stored = torch.load(weights, map_location="cpu", weights_only=True)
+        except pickle.UnpicklingError:
+            raise ValueError(
+                f"{weights} holds more than the tensors of a state dict, and loading that would "
+                "execute what is in it: save module.state_dict()"
+            ) from None
+        found.load_state_dict(stored)
     if isinstance(found, TensorDictModuleBase):
         return found
     if not callable(found):

@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import csv
+import shlex
+
+import pytest
+
+from torchrl_l1.cli import main
+
+TINY = ["--steps", "300", "--episodes", "2", "--most-steps", "15"]
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def refused(arguments, capsys) -> str:
+    with pytest.raises(SystemExit) as exit_info:
+        main(arguments)
+    assert exit_info.value.code == 1
+    printed = capsys.readouterr()
+    assert "Traceback" not in printed.err
+    return printed.err
+
+
+@pytest.mark.filterwarnings("ignore:the model is too poor")
+def test_from_a_policy_to_a_controller_that_python_loads(policy_file, tmp_path, capsys):
+    output = tmp_path / "out"
+    policy = f"{policy_file}:balance"
+    main(["robustify", "inverted_pendulum", "--policy", policy, "--bias", "0", "0.5", *TINY,
+          "--output", str(output)])  # fmt: skip
+    printed = capsys.readouterr().out
+    with (output / "evaluation.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {(row["bias"], row["l1"]) for row in rows} == {
+        (bias, l1) for bias in ("0.0", "0.5") for l1 in ("off", "paper", "robust", "oracle")
+    }
+    assert (output / "evaluation.png").stat().st_size > 5000
+    page = (output / "README.md").read_text()
+    assert "| bias 0.5 |" in page and "L1Config(dt=0.04" in page
+    for name in ("evaluation.csv", "evaluation.png", "README.md", "controller"):
+        assert str(output / name) in printed
+    # The last lines are Python, and they run.
+    usage = printed.partition("To use it:\n\n")[2]
+    assert len(usage.strip().splitlines()) == 5
+    names: dict[str, object] = {}
+    exec(usage.replace("rollout(1000,", "rollout(7,"), names)
+    assert names["data"]["next", "l1", "u_exec"].shape == (1, 7, 1)
+
+    main(["export", str(output), "policy.pt", "--steps", "10"])
+    assert "Largest difference in 10 steps" in capsys.readouterr().out
+    assert (tmp_path / "policy.pt").exists()
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("robustify nowhere --policy sb3:x.zip", "unknown environment 'nowhere'"),
+        ("robustify hopper --policy sb3:x.zip", "no file x.zip"),
+        ("robustify hopper --policy p --suite quick --bias 1", "--suite or --bias, not both"),
+        ("robustify CartPole-v1 --policy sb3:x.zip --dt 0.02", "continuous actions"),
+        ("play nowhere", "no folder nowhere"),
+        ("play hopper --output film.avi", "must end in"),
+        ("export nowhere file.pt", "no folder nowhere"),
+    ],
+)
+def test_refusals_of_one_line(line, message, capsys, monkeypatch):
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert message in refused(shlex.split(line), capsys)

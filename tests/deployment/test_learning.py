@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.data import Bounded, Unbounded
+
+from torchrl_l1.deployment import Exploration, environment_source, load_policy, target_switch_rate
+from torchrl_l1.deployment.learning import collect, epsilon_for, switch_rates
+from torchrl_l1.dynamics import EnsembleDynamics
+
+from .conftest import balance
+
+ZERO = TensorDictModule(lambda x: 0 * x[..., :2], ["observation"], ["action"])
+
+
+def explored(action, noise, steps=400):
+    torch.manual_seed(0)
+    policy = Exploration(ZERO, action, noise)
+    data = TensorDict(observation=torch.zeros(5, 3), batch_size=[5])
+    return torch.stack([policy(data.clone())["action"] for _ in range(steps)])
+
+
+def test_noise_is_relative_to_the_range_and_partly_held():
+    wide = explored(Bounded(-40.0, 40.0, (5, 2)), 0.1)
+    narrow = explored(Bounded(-4.0, 4.0, (5, 2)), 0.1)
+    free = explored(Unbounded((5, 2)), 0.1)
+    torch.testing.assert_close(wide, 10 * narrow)
+    torch.testing.assert_close(wide, 40 * free)
+    # The mean square of a level between none and twice is 4/3 of its mean's square.
+    assert free.std().item() == pytest.approx(0.1 * (4 / 3) ** 0.5, rel=0.15)
+    lagged = (free[1:] * free[:-1]).mean() / free.square().mean()
+    assert 0.3 < lagged < 0.6  # half of it, nine times in ten
+
+
+def test_noise_stays_within_the_bounds():
+    assert explored(Bounded(-1.0, 1.0, (5, 2)), 3.0).abs().max() == 1.0
+    assert explored(Bounded(-1.0, 1.0, (5, 2)), 0.0).abs().max() == 0.0
+
+
+def test_data_are_those_of_the_seed():
+    source = environment_source("inverted_pendulum")
+    policy = load_policy(balance, source.one())
+    counted = []
+    first, same, other = (
+        collect(source, policy, 25, 2, 0.3, seed, counted.append) for seed in (0, 0, 1)
+    )
+    assert first.shape == (2, 13) and sum(counted) >= 24
+    assert torch.equal(first["next", "observation"], same["next", "observation"])
+    assert not torch.equal(first["next", "observation"], other["next", "observation"])
+
+
+def test_rates_are_those_of_the_switching_law_step_by_step():
+    torch.manual_seed(1)
+    model = EnsembleDynamics(3, 2, members=2, hidden=(16,), activation="tanh")
+    x, u = torch.randn(2, 30, 3), torch.randn(2, 30, 2)
+    started = torch.ones(2, 30, dtype=torch.bool)
+    started[:, 0] = started[1, 12] = False
+    epsilons = [0.02, 0.1, 0.5]
+    expected = []
+    for epsilon in epsilons:
+        count = 0
+        for row in range(2):
+            for step in range(30):
+                if not started[row, step]:
+                    u_bar = u[row, step]
+                    continue
+                value, jacobian = model.value_and_jacobian(x[row, step], u_bar)
+                tangent = value + jacobian @ (u[row, step] - u_bar)
+                error = model.mean_change(x[row, step], u[row, step]) - tangent
+                if np.linalg.norm(error.detach().numpy()) > epsilon:
+                    count, u_bar = count + 1, u[row, step]
+        expected.append(1000 * count / 57)
+    assert expected[0] > expected[-1]
+    found = switch_rates(model, x, u, started, torch.tensor(epsilons))
+    assert found.tolist() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("rate", [50.0, 350.0])
+def test_epsilon_gives_the_rate_that_is_asked_for(rate):
+    torch.manual_seed(2)
+    model = EnsembleDynamics(3, 1, members=2, hidden=(16,), activation="tanh")
+    data = TensorDict(
+        {"observation": torch.randn(4, 250, 3), "action": torch.randn(4, 250, 1)}, [4, 250]
+    )
+    done = torch.zeros(4, 250, 1, dtype=torch.bool)
+    data["next"] = TensorDict({"done": done}, [4, 250])
+    epsilon, found = epsilon_for(model, data, rate)
+    assert epsilon > 0 and found == pytest.approx(rate, rel=0.1)
+
+
+def test_the_rule_of_thumb_changes_at_five_entries():
+    assert [target_switch_rate(n) for n in (1, 4, 5, 18)] == [50.0, 50.0, 350.0, 350.0]

@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from torchrl_l1.deployment import play
+from torchrl_l1.envs.rendering import RenderingUnavailable
+
+
+def flat(value: int, count: int, label: str = "", ended: bool = False) -> play.Film:
+    frames = [np.full((60, 200, 3), value, np.uint8) for _ in range(count)]
+    return play.Film(label, frames, float(count), ended)
+
+
+def test_the_shorter_film_holds_its_last_frame():
+    frames = play.side_by_side([flat(50, 2, "L1 off", ended=True), flat(90, 4)])
+    assert len(frames) == 4
+    assert all(frame.shape == (60, 400, 3) for frame in frames)
+    assert all(
+        (frame[40:, :200] == 50).all() and (frame[40:, 200:] == 90).all() for frame in frames
+    )
+    assert (frames[3][:40] != frames[1][:40]).any()  # it says that it has ended
+
+
+def test_films_run_in_real_time(tmp_path):
+    frames = [np.full((20, 20, 3), 10 * k, np.uint8) for k in range(20)]
+    for dt, count in ((0.04, 20), (0.01, 10), (0.005, 5)):
+        file = play.write_film(frames, tmp_path / "film.gif", dt)
+        with Image.open(file) as image:
+            assert image.n_frames == count
+            assert image.info["duration"] == pytest.approx(1000 * 20 * dt / count, abs=1)
+
+
+def test_films_as_mp4(tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    file = play.write_film(play.side_by_side([flat(200, 25)]), tmp_path / "film.mp4", 0.04)
+    meta = next(ffmpeg.read_frames(str(file)))
+    assert meta["size"] == (200, 60) and meta["fps"] == 25
+
+
+def test_what_cannot_be_shown_is_refused_at_once(monkeypatch, tmp_path):
+    with pytest.raises(ValueError, match="must end in"):
+        play.check_film(tmp_path / "film.avi")
+    monkeypatch.setattr(play.sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(ValueError, match="no display"):
+        play.check_film(None)
+
+
+def test_a_film_of_an_episode(robust):
+    try:
+        films = [
+            play.film(robust, l1, {"bias": 1.0}, steps=12, size=(80, 60))
+            for l1 in ("off", "robust")
+        ]
+    except RenderingUnavailable as error:
+        pytest.skip(f"this machine has no off-screen OpenGL: {error}")
+    off, on = films
+    assert (off.label, on.label) == ("L1 off", "L1 robust")
+    assert off.frames[0].shape == (60, 80, 3) and 11 <= len(off.frames) <= 12
+    # L1 cancels the bias: the two part.
+    assert (off.frames[-1] != on.frames[-1]).any() and off.total < on.total
+
+
+def test_poses_of_gymnasiums_own_environments(robust):
+    from torchrl_l1.deployment import environment_source
+
+    env = environment_source("InvertedPendulum-v5").single(seed=0)
+    data = env.reset()
+    # Its observation begins with the positions.
+    np.testing.assert_allclose(play._pose(env), data["observation"][:2].numpy(), rtol=1e-6)
+    assert play._physics(env)[0].nq == 2
+    assert play._physics(environment_source("Pendulum-v1").one()) is None
