@@ -25,6 +25,9 @@ def test_one_call_from_a_policy_to_a_robust_one(robust):
     assert robust.config.dt == 0.04 and robust.config.filter == "kalman"
     assert robust.settings("paper").filter == "low_pass"
     assert min(robust.model.quality.explained) > 0.8
+    # The filter's numbers are those of the data, not those of a model that knows none.
+    assert robust.model.residuals.measured
+    assert robust.model.residuals.calibrated
     env = robust.wrap(make_env("inverted_pendulum", 3, bias=0.5, seed=0))
     assert isinstance(env.transform[-1], L1Transform)
     data = env.rollout(60, robust.policy)

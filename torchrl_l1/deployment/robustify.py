@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
+from torchrl.data import Bounded
 from torchrl.envs import EnvBase, TransformedEnv
 from tqdm import tqdm
 
@@ -31,7 +32,7 @@ from torchrl_l1.deployment.learning import (
     target_switch_rate,
 )
 from torchrl_l1.deployment.policies import Policy, load_policy
-from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, fit_dynamics
+from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, calibrate_filter, fit_dynamics
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.files import write_atomically
 from torchrl_l1.experiment.l1_options import OFF, closest_option, l1_option
@@ -325,6 +326,14 @@ def robustify(
         "weights": weights,
     }
     configs = {"robust": L1Config.robust(dt), "paper": L1Config.paper(dt, epsilon=epsilon)}
+    action = env.full_action_spec["action"]
+    bounds = action if isinstance(action, Bounded) else None
+    calibrate_filter(
+        dynamics.residuals,
+        dynamics.value_and_jacobian,
+        data.reshape(-1).select("observation", "action", ("next", "observation")).float(),
+        L1Config.robust(dt, action_low=bounds, action_high=bounds),
+    )
     order = [preset, *(name for name in PRESETS if name != preset)]
     return RobustController(
         source, acting, dynamics, {name: configs[name] for name in reversed(order)},

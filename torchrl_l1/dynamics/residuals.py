@@ -28,12 +28,14 @@ class Residuals(nn.Module):
         inflation: factor on the covariance that a Kalman filter needs, ``()``; see
             :class:`~torchrl_l1.control.ResidualStatistics`, like the next.
         process_noise: of a disturbance, ``()``.
+        calibrated: whether these two are of data, ``()``, bool.
     """
 
     covariance: Tensor
     measured: Tensor
     inflation: Tensor
     process_noise: Tensor
+    calibrated: Tensor
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -41,6 +43,7 @@ class Residuals(nn.Module):
         self.register_buffer("measured", torch.tensor(False))
         self.register_buffer("inflation", torch.tensor(1.0))
         self.register_buffer("process_noise", torch.tensor(0.01))
+        self.register_buffer("calibrated", torch.tensor(False))
 
     @torch.no_grad()
     def measure(self, residual: Tensor) -> None:
@@ -142,6 +145,7 @@ def calibrate_filter(
     )
     residuals.inflation.fill_(found.inflation)
     residuals.process_noise.fill_(found.process_noise)
+    residuals.calibrated.fill_(True)
     return found
 
 

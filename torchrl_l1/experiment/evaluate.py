@@ -117,6 +117,8 @@ def _measure_residuals(algorithm: Algorithm, buffer: dict[str, Any], recipe: Run
     if not bool(dynamics.residuals.measured) and held_out.shape[0]:
         held_out = held_out.set("action", held_out[action_key])
         dynamics.residuals.measure(one_step_residuals(dynamics, held_out))
+    if bool(dynamics.residuals.calibrated):
+        return
     config = L1Config.robust(task.dt, action_low=task.action_low, action_high=task.action_high)
     calibrate_filter(dynamics.residuals, dynamics.value_and_jacobian, data, config, action_key)
 
