@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from torchrl_l1.checks import check_choice, check_count, check_not_negative, check_positive
 from torchrl_l1.control import L1Config, L1Transform
+from torchrl_l1.control.layout import Layout
 from torchrl_l1.deployment.assessment import Assessment, Disturbances, assess
 from torchrl_l1.deployment.environments import (
     EnvironmentSource,
@@ -324,7 +325,11 @@ def robustify(
         "normalization": normalization,
         "weights": weights,
     }
-    configs = {"robust": L1Config.robust(dt), "paper": L1Config.paper(dt, epsilon=epsilon)}
+    layout = Layout.of(env, "observation", "action")
+    configs = {
+        "robust": layout.bounded(L1Config.robust(dt)),
+        "paper": layout.bounded(L1Config.paper(dt, epsilon=epsilon)),
+    }
     order = [preset, *(name for name in PRESETS if name != preset)]
     return RobustController(
         source, acting, dynamics, {name: configs[name] for name in reversed(order)},
