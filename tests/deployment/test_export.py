@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from torchrl_l1.deployment import RobustController, export
 from torchrl_l1.deployment.export import cholesky, cholesky_solve, solve_triangular
@@ -66,8 +66,7 @@ def test_sampling_policies_export_their_mean(robust, tmp_path):
         torch.nn.Sequential(network, NormalParamExtractor()), ["observation"], ["loc", "scale"]
     )
     actor = ProbabilisticActor(
-        module, ["loc", "scale"], ["action"], distribution_class=TanhNormal,
-        distribution_kwargs={"low": -3.0, "high": 3.0},
+        module, ["loc", "scale"], ["action"], distribution_class=IndependentNormal,
     )  # fmt: skip
     found = export(with_policy(robust, actor), tmp_path / "policy.pt", steps=10)
     assert found.error < 1e-5

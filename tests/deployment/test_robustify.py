@@ -24,6 +24,7 @@ def test_one_call_from_a_policy_to_a_robust_one(robust):
     assert torchrl_l1.robustify is robustify
     assert robust.config.dt == 0.04 and robust.config.filter == "kalman"
     assert robust.settings("paper").filter == "low_pass"
+    assert robust.config.half_range == 3.0
     assert min(robust.model.quality.explained) > 0.8
     # The filter's numbers are those of the data, not those of a model that knows none.
     assert robust.model.residuals.measured

@@ -151,5 +151,5 @@ def _log(options: argparse.Namespace, table: Assessment, chart: Path, output: Pa
         settings=wandb.Settings(silent=True, console="off"),
     ) as run:
         columns: list[str | int] = list(dict.fromkeys(key for row in table for key in row))
-        rows = [[row.get(key) for key in columns] for row in table]
+        rows = [[row.get(str(key)) for key in columns] for row in table]
         run.log({"evaluation": wandb.Table(columns, rows), "chart": wandb.Image(str(chart))})

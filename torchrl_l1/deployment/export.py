@@ -157,12 +157,13 @@ def export(
         try:
             step = _WRITERS[format](module, example, file, inputs, outputs)
         except Exception as error:  # of the tracers, anything
-            if with_policy and not _is_torch(robust.policy, first):
-                raise ValueError(
-                    "the policy cannot be exported, since it is not made of torch's operations: "
-                    "export L1 alone (with_policy=False, --without-policy)"
-                ) from error
-            raise
+            if not with_policy:
+                raise
+            why = next(iter(str(error).split("\n", 1)), "").strip() or type(error).__name__
+            raise ValueError(
+                f"the policy cannot be written as {format} ({why}): try .pt2, or export L1 alone "
+                "(with_policy=False, --without-policy)"
+            ) from error
         worst = _compare(step, recorded, module, with_policy)
     half = config.half_range
     allowed = tolerance * (min(half) if isinstance(half, tuple) else half)
@@ -195,17 +196,6 @@ def vector_bounds(robust: RobustController) -> dict[str, Any]:
         if getattr(robust.config, name) is None and bound is not None:
             found[name] = tuple(bound.reshape(-1).tolist())
     return found
-
-
-def _is_torch(policy: TensorDictModuleBase, observation: Tensor) -> bool:
-    """Whether a policy's action carries the derivative of its observation."""
-    if not isinstance(policy, FunctionPolicy):
-        return True
-    try:
-        with torch.enable_grad():
-            return policy.act(observation.clone().requires_grad_()).requires_grad
-    except Exception:  # such as a call of numpy() on what needs a gradient
-        return False
 
 
 def _compare(

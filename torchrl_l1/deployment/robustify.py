@@ -12,12 +12,12 @@ from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torchrl.data import Bounded
 from torchrl.envs import EnvBase, TransformedEnv
 from tqdm import tqdm
 
 from torchrl_l1.checks import check_choice, check_count, check_not_negative, check_positive
 from torchrl_l1.control import L1Config, L1Transform
+from torchrl_l1.control.layout import Layout
 from torchrl_l1.deployment.assessment import Assessment, Disturbances, assess
 from torchrl_l1.deployment.environments import (
     EnvironmentSource,
@@ -325,14 +325,16 @@ def robustify(
         "normalization": normalization,
         "weights": weights,
     }
-    configs = {"robust": L1Config.robust(dt), "paper": L1Config.paper(dt, epsilon=epsilon)}
-    action = env.full_action_spec["action"]
-    bounds = action if isinstance(action, Bounded) else None
+    layout = Layout.of(env, "observation", "action")
+    configs = {
+        "robust": layout.bounded(L1Config.robust(dt)),
+        "paper": layout.bounded(L1Config.paper(dt, epsilon=epsilon)),
+    }
     calibrate_filter(
         dynamics.residuals,
         dynamics.value_and_jacobian,
         data.reshape(-1).select("observation", "action", ("next", "observation")).float(),
-        L1Config.robust(dt, action_low=bounds, action_high=bounds),
+        configs["robust"],
     )
     order = [preset, *(name for name in PRESETS if name != preset)]
     return RobustController(
