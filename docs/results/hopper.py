@@ -1,6 +1,6 @@
 """Hopper under an actuator bias: who keeps it standing, for how long, and how it looks.
 
-    torchrl-l1 run metrpo/hopper l1=off outer_iterations=15 run_dir=runs/hopper --resume
+    torchrl-l1 run metrpo/hopper l1=off outer_iterations=20 threads=1 run_dir=runs/hopper --resume
     python docs/results/hopper.py runs/hopper
 
 Writes `hopper.csv` (one row per episode), `hopper.md`, `hopper.png` and `hopper_filmstrip.png`
