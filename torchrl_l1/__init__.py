@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         L1State,
         L1Transform,
     )
+    from torchrl_l1.deployment import RobustController, robustify
     from torchrl_l1.dynamics import (
         EnsembleDynamics,
         EnsembleDynamicsLoss,

@@ -106,9 +106,11 @@ def truncated(content: bytes) -> bytes:
 
 
 def flipped(content: bytes) -> bytes:
-    """A bit of a weight: it loads, and torch does not notice."""
-    place = len(content) // 2
-    return content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
+    """Bits of weights: they load, and torch does not notice."""
+    # More than fits between two entries of the archive, which nothing reads.
+    place, length = len(content) // 2, 128
+    damaged = bytes(byte ^ 1 for byte in content[place : place + length])
+    return content[:place] + damaged + content[place + length :]
 
 
 class Harmful:

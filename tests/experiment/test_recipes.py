@@ -262,6 +262,7 @@ NEWER = {"fit.precision": "float32", "precision": "float32"} | {
     if name not in ("bias", "gain")
 }
 NEWER |= {
+    "on_divergence": "stop",
     "l1.estimator": "least_squares",
     "l1.filter": "low_pass",
     "l1.covariance": "residuals",
@@ -287,7 +288,7 @@ def without_newer(settings: DictConfig) -> DictConfig:
     """The settings but for those that are newer, which do what was done without them."""
     older = OmegaConf.create(OmegaConf.to_container(settings, resolve=True))
     # Planners have had a precision of their own all along.
-    names = [name for name in NEWER if "." in name or settings.get("algorithm") == "metrpo"]
+    names = [n for n in NEWER if n != "precision" or settings.get("algorithm") == "metrpo"]
     for name in names if "algorithm" in settings else []:
         assert OmegaConf.select(older, name) == NEWER[name]
         parent, _, key = name.rpartition(".")

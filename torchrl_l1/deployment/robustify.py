@@ -284,8 +284,8 @@ def robustify(
     Examples:
         >>> from torchrl_l1.dynamics import FitConfig
         >>> robust = robustify(
-        ...     "inverted_pendulum", lambda x: -x[..., 1:2], steps=200, progress=False,
-        ...     model={"hidden": [8]}, fit=FitConfig(max_epochs=1), environments=2,
+        ...     "inverted_pendulum", lambda x: 10 * x[..., 1:2], steps=1000, progress=False,
+        ...     model={"hidden": [32]}, fit=FitConfig(max_gradient_steps=400, max_epochs=400),
         ... )
         >>> robust.config.dt, robust.preset
         (0.04, 'robust')

@@ -316,7 +316,7 @@ def fit_dynamics(
         >>> x, u = torch.randn(500, 2, dtype=torch.float64), torch.randn(500, 1)
         >>> data = TensorDict({"observation": x, "action": u}, batch_size=[500])
         >>> data["next", "observation"] = 0.9 * x + 0.1 * u
-        >>> model = fit_dynamics(data, hidden=(32,), names=["angle", "rate"])
+        >>> model = fit_dynamics(data, hidden=(64,), names=["angle", "rate"])
         >>> model.quality.validation
         50
     """

@@ -60,6 +60,8 @@ def orderly_end() -> Iterator[None]:
     try:
         yield
     finally:
+        # What the signal asked for has been done, or cannot be done any more.
+        _asked = False
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
