@@ -6,7 +6,7 @@ import argparse
 
 from torchrl_l1.deployment import export, load_target
 from torchrl_l1.deployment.export import FORMATS
-from torchrl_l1.deployment.robustify import PRESETS
+from torchrl_l1.deployment.robust_controller import PRESETS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torchrl_l1.deployment import load_target
 from torchrl_l1.deployment.play import check_film, film, show_film, side_by_side, write_film
-from torchrl_l1.deployment.robustify import PRESETS
+from torchrl_l1.deployment.robust_controller import PRESETS
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.l1_options import OFF
 

@@ -9,7 +9,7 @@ from typing import Any
 import wandb
 
 from torchrl_l1.deployment import Assessment, RobustController, robustify
-from torchrl_l1.deployment.robustify import PRESETS
+from torchrl_l1.deployment.robust_controller import PRESETS
 from torchrl_l1.envs import DISTURBANCES, SUITES
 from torchrl_l1.experiment.files import write_atomically, write_table
 from torchrl_l1.experiment.run import MODES, check_wandb_mode

@@ -10,7 +10,7 @@ from torchrl_l1.deployment.environments import (
 from torchrl_l1.deployment.export import ControlledStep, Exported, export
 from torchrl_l1.deployment.learning import Exploration, target_switch_rate
 from torchrl_l1.deployment.policies import FunctionPolicy, StableBaselinesPolicy, load_policy
-from torchrl_l1.deployment.robustify import RobustController, load_target, robustify
+from torchrl_l1.deployment.robust_controller import RobustController, load_target, robustify
 
 __all__ = [
     "Assessment",

@@ -22,7 +22,7 @@ from torchrl_l1.control import ActionJacobian, L1Config, L1State, L1Transform, a
 from torchrl_l1.deployment.assessment import run_episodes
 from torchrl_l1.deployment.environments import require
 from torchrl_l1.deployment.policies import FunctionPolicy
-from torchrl_l1.deployment.robustify import RobustController
+from torchrl_l1.deployment.robust_controller import RobustController
 from torchrl_l1.dynamics import EnsembleDynamics
 
 FORMATS = {".pt": "torchscript", ".ts": "torchscript", ".onnx": "onnx", ".pt2": "export"}

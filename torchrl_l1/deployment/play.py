@@ -22,7 +22,7 @@ from torchrl_l1.algorithms.collection import seed_streams, stream_seed
 from torchrl_l1.control import L1Transform
 from torchrl_l1.deployment.environments import require, simulation_of
 from torchrl_l1.deployment.learning import policy_transforms
-from torchrl_l1.deployment.robustify import RobustController
+from torchrl_l1.deployment.robust_controller import RobustController
 from torchrl_l1.envs.rendering import draw_poses, rollout_frames
 from torchrl_l1.experiment.l1_options import OFF
 

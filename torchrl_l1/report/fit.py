@@ -17,7 +17,7 @@ def draw_fit_quality(quality: FitQuality, file: str | Path) -> Path:
     where the model diverges, the line ends.
 
     Args:
-        quality: of the model, see :attr:`~torchrl_l1.dynamics.EnsembleDynamics.quality`.
+        quality: of the model, see ``EnsembleDynamics.quality``.
         file: where to, such as ``"quality.png"``.
 
     Returns:
