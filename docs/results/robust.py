@@ -94,27 +94,50 @@ def harm(episodes: Sequence[Row], noise: str, l1: str, draws: int = 4000) -> dic
 
 
 def overall(episodes: Sequence[Row]) -> dict[str, str]:
-    """What the controllers recover of all disturbances together, every one with the same weight."""
+    """What the controllers recover of the disturbances that cost something, of equal weight.
+
+    Those are the ones whose oracle is better than no controller, with its 95 % interval.
+    """
     runs = sorted({row["run"] for row in episodes})
+    disturbances = sorted({(row["bias"], row["signs"]) for row in episodes} - {(0.0, 0.0)})
 
-    def returns(l1: str, run: str) -> np.ndarray:
-        rows = [
-            row
-            for row in episodes
-            if (row["run"], row["l1"], row["noise"]) == (run, l1, "none")
-            and not row["bias"] == 0 == row["signs"]
+    def returns(l1: str, disturbance: tuple[float, float]) -> list[np.ndarray]:
+        return [
+            np.array(
+                [
+                    row["return"]
+                    for row in episodes
+                    if (row["run"], row["l1"], row["noise"]) == (run, l1, "none")
+                    and (row["bias"], row["signs"]) == disturbance
+                ]
+            )
+            for run in runs
         ]
-        rows.sort(key=lambda row: (row["bias"], row["signs"], row["episode"]))
-        return np.array([row["return"] for row in rows])
 
-    of = {l1: [returns(l1, run) for run in runs] for l1 in ("off", "paper", "robust", "oracle")}
-    line = {name: f"{np.mean(np.concatenate(values)):.0f}" for name, values in of.items()}
-    for l1 in ("paper", "robust"):
-        found = recovered(of["off"], of[l1], of["oracle"])
-        share = "–"
-        if found.share is not None and found.interval is not None:
-            share = f"{found.share:.2f} [{found.interval.low:.2f}, {found.interval.high:.2f}]"
-        line[f"{l1} recovered"] = share
+    of = {
+        (l1, disturbance): returns(l1, disturbance)
+        for l1 in ("off", "paper", "robust", "oracle")
+        for disturbance in disturbances
+    }
+    costly = [
+        one
+        for one in disturbances
+        if recovered(of["off", one], of["oracle", one], of["oracle", one]).gap_interval.low > 0
+    ]
+    line = {"costly disturbances": f"{len(costly)} of {len(disturbances)}"}
+
+    def together(l1: str) -> list[np.ndarray]:
+        return [
+            np.concatenate([of[l1, one][index] for one in costly]) for index in range(len(runs))
+        ]
+
+    for l1 in ("off", "paper", "robust", "oracle") if costly else ():
+        line[l1] = f"{np.mean(np.concatenate(together(l1))):.4g}"
+    for l1 in ("paper", "robust") if costly else ():
+        found = recovered(together("off"), together(l1), together("oracle"))
+        assert found.share is not None and found.interval is not None
+        low, high = found.interval.low, found.interval.high
+        line[f"{l1} recovered"] = f"{found.share:.2f} [{low:.2f}, {high:.2f}]"
     return line
 
 
