@@ -4,7 +4,7 @@
 
 Every rule gets the same posterior mean d and standard deviation s of the disturbance, from the same
 Kalman filter, and says what the input cancels. Writes `acting.csv` and `acting.md` beside this
-file: returns of 24 episodes of the policy's mean action, paired by their resets with L1 off.
+file: returns of 16 episodes of the policy's mean action, paired by their resets with L1 off.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.report.page import markdown
 
 HERE = Path(__file__).parent
-EPISODES, SEED = 24, 0
+EPISODES, SEED = 16, 0
 CONDITIONS: dict[str, dict[str, Any]] = {
     "undisturbed": {},
     "action noise": {"noise": "action"},
