@@ -151,3 +151,22 @@ def test_it_compiles_as_one_graph():
     )
     with pytest.raises(ValueError, match=r"L1: 'observation' is not what the environment gave"):
         compiled(observation, observation + 0.1, *entries)
+
+
+def test_a_change_of_type_is_none_with_a_kalman_filter():
+    # Entries of the Jacobian cancel in a sum, whose rounding is theirs.
+    config = L1Config.robust(0.05, action_low=-1.0, action_high=1.0)
+    fresh = init([], 3, 1, config, dtype=torch.float64)
+    jacobian = torch.tensor([10.1, -7.03, -3.06], dtype=torch.float64)
+    x = 1e-3 * torch.ones(3, dtype=torch.float64)
+    state = fresh._replace(x_hat=x, jacobian=jacobian, started=torch.tensor([True]))
+    seal = sealed(x, state)
+    entries = {
+        name: value.float().double() if value.is_floating_point() else value
+        for name, value in state.entries().items()
+    }
+    rounded = L1State(**entries)
+    verify(x, rounded, seal.float().double(), owner="L1", observation_key="observation", key="l1")
+    lost = rounded._replace(jacobian=torch.zeros_like(jacobian))
+    with pytest.raises(ValueError, match="jacobian"):
+        verify(x, lost, seal, owner="L1", observation_key="observation", key="l1")

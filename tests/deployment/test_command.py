@@ -48,7 +48,7 @@ def test_from_a_policy_to_a_controller_that_python_loads(policy_file, tmp_path, 
     exec(usage.replace("rollout(1000,", "rollout(7,"), names)
     assert names["data"]["next", "l1", "u_exec"].shape == (1, 7, 1)
 
-    main(["export", str(output), "policy.pt", "--steps", "10"])
+    main(["export", str(output), "policy.pt", "--steps", "10", "--trust"])
     assert "Largest difference in 10 steps" in capsys.readouterr().out
     assert (tmp_path / "policy.pt").exists()
 

@@ -59,7 +59,29 @@ def test_what_is_saved_acts_the_same(robust, policy_file, tmp_path):
     )
     assert torch.equal(first["next", "l1", "u_exec"], second["next", "l1", "u_exec"])
     assert loaded.configs == robust.configs and loaded.preset == robust.preset
-    assert load_target(str(tmp_path)).configs == robust.configs
+    assert load_target(str(tmp_path), trusted=True).configs == robust.configs
+    with pytest.raises(ValueError, match="say --trust"):
+        load_target(str(tmp_path))
+
+
+@pytest.mark.parametrize("content", ["[]", "3", "{}", '{"format": 1}', "{", '{"format": 7}', ""])
+def test_a_damaged_controller_is_named(content, tmp_path):
+    (tmp_path / "controller.json").write_text(content)
+    with pytest.raises(ValueError, match=r"controller\.json (is damaged|has the format)"):
+        RobustController.load(tmp_path)
+
+
+def test_files_of_one_name_do_not_overwrite_each_other(robust, tmp_path):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "model.safetensors").write_text(folder)
+    origin = {
+        "policy": f"onnx:{tmp_path / 'a' / 'model.safetensors'}",
+        "weights": str(tmp_path / "b" / "model.safetensors"),
+    }
+    saved = replace(robust, origin=origin).save(tmp_path / "controller")
+    assert (saved / "policy_model.safetensors").read_text() == "a"
+    assert (saved / "weights_model.safetensors").read_text() == "b"
 
 
 def test_files_of_policies_go_into_the_folder(robust, tmp_path):

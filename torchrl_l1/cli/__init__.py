@@ -96,6 +96,7 @@ def _dispatch(options: argparse.Namespace, rest: list[str]) -> None:
             from torchrl_l1.experiment.recipes import available_campaigns, available_recipes
 
             print("\n".join([*available_recipes(), "", "Campaigns:", *available_campaigns()]))
+        sys.stdout.flush()  # while a broken pipe can still be named
     except USER_ERRORS as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise

@@ -19,12 +19,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--without-policy", action="store_true", help="L1 alone: the action is a second input")
     add("--steps", type=int, default=100, help="steps on which it is compared with the original")
     add("--seed", type=int, default=0, help="of those steps")
+    add("--trust", action="store_true", help="run the functions and pickles that a folder names")
 
 
 def export_command(options: argparse.Namespace) -> None:
     """``torchrl-l1 export``: the file, its inputs and outputs, and how exact it is."""
     found = export(
-        load_target(options.target),
+        load_target(options.target, trusted=options.trust),
         options.file,
         format=options.format,
         preset=options.l1,

@@ -9,6 +9,7 @@ from torchrl_l1.deployment import load_target
 from torchrl_l1.deployment.play import check_film, film, show_film, side_by_side, write_film
 from torchrl_l1.deployment.robust_controller import PRESETS
 from torchrl_l1.envs import DISTURBANCES
+from torchrl_l1.envs.rendering import RenderingUnavailable
 from torchrl_l1.experiment.l1_options import OFF
 
 
@@ -18,6 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("target", help="a controller's folder, a run directory, or an environment, with --policy")
     add("--policy", help="the policy in an environment, see robustify; it has no L1 then")
     add("--normalization", metavar="FILE", help="statistics of VecNormalize, see robustify")
+    add("--trust", action="store_true", help="run the functions and pickles that a folder names")
     add("--weights", metavar="FILE", help="a state dict to load into the policy's module")
     add("--l1", choices=(OFF, *PRESETS), help="what acts; the target's own by default")
     add("--compare", action="store_true", help="L1 off and on side by side")
@@ -37,14 +39,23 @@ def play_command(options: argparse.Namespace) -> None:
         raise ValueError(f"--steps must be positive, got {options.steps}")
     given = {name: getattr(options, name) for name in DISTURBANCES}
     disturbances = {name: value for name, value in given.items() if value is not None}
-    robust = load_target(options.target, options.policy, options.normalization, options.weights)
+    robust = load_target(
+        options.target,
+        options.policy,
+        options.normalization,
+        options.weights,
+        trusted=options.trust,
+    )
     on = options.l1 or robust.preset
     if options.compare and on == OFF:
         raise ValueError("--compare shows L1 off beside L1 on: give --l1 robust, or leave it out")
-    films = [
-        film(robust, l1, disturbances, steps=options.steps, seed=options.seed)
-        for l1 in ([OFF, on] if options.compare else [on])
-    ]
+    try:
+        films = [
+            film(robust, l1, disturbances, steps=options.steps, seed=options.seed)
+            for l1 in ([OFF, on] if options.compare else [on])
+        ]
+    except RenderingUnavailable as error:
+        raise ValueError(str(error)) from error
     for one in films:
         end = "ended" if one.ended else "cut off"
         print(f"{one.label}: return {one.total:.6g}, {end} after {len(one.frames)} steps")

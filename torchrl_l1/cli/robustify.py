@@ -8,6 +8,7 @@ from typing import Any
 
 import wandb
 
+from torchrl_l1.checks import check_count
 from torchrl_l1.deployment import Assessment, RobustController, robustify
 from torchrl_l1.deployment.robust_controller import PRESETS
 from torchrl_l1.envs import DISTURBANCES, SUITES
@@ -65,6 +66,8 @@ def robustify_command(options: argparse.Namespace) -> None:
         raise ValueError(f"give --suite or --{next(iter(disturbances))}, not both")
     disturbances = options.suite or disturbances
     check_wandb_mode(options.wandb)
+    check_count("episodes", options.episodes)
+    check_count("most_steps", options.most_steps)
     output = Path(options.output or Path("runs/robustify", _folder(options.env)))
     if output.exists() and not output.is_dir():
         raise ValueError(f"{output} is a file; choose another --output")

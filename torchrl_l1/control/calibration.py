@@ -81,7 +81,8 @@ def calibrate(
         the two numbers and what they were chosen by.
 
     Raises:
-        ValueError: if there are fewer than 20 steps in the episodes, or entries are not finite.
+        ValueError: if there are fewer than 20 steps in the episodes, entries are not finite, or the
+            settings have no Kalman filter.
 
     Examples:
         >>> generator = torch.Generator().manual_seed(0)
@@ -90,6 +91,8 @@ def calibrate(
         >>> calibrate(config, white, torch.ones(64, 100, 2, 1), 0.01 * torch.eye(2)).inflation
         1.0
     """
+    if config.filter != "kalman":
+        raise ValueError("there is nothing to calibrate without filter='kalman'")
     sequences, steps, n, m = jacobian.shape
     if residual.shape != (sequences, steps, n):
         raise ValueError(
@@ -101,15 +104,22 @@ def calibrate(
             f"calibration needs episodes of at least {2 * _SETTLED} steps, got {sequences} of "
             f"{steps}"
         )
-    if not (residual.isfinite().all() and jacobian.isfinite().all()):
-        raise ValueError("calibration needs finite residuals and Jacobians: leave the others out")
+    action = jacobian.new_zeros(sequences, steps, m) if action is None else action
+    if action.shape != (sequences, steps, m):
+        raise ValueError(
+            f"action has shape {tuple(action.shape)}, expected {(sequences, steps, m)} as the "
+            "Jacobian"
+        )
+    if not all(values.isfinite().all() for values in (residual, jacobian, action)):
+        raise ValueError(
+            "calibration needs finite residuals, Jacobians and actions: leave the others out"
+        )
     if generator is None:
         generator = torch.Generator().manual_seed(0)
     half_range = torch.as_tensor(config.half_range).to(residual).expand(m)
     disturbance = _steps(sequences, steps, m, generator).to(residual)
     disturbance = disturbance * config.initial_deviation * half_range
     disturbance = torch.cat([torch.zeros_like(disturbance), disturbance])
-    action = disturbance.new_zeros(sequences, steps, m) if action is None else action
     residual, action = residual.repeat(2, 1, 1), action.repeat(2, 1, 1)
     jacobian = jacobian.repeat(2, 1, 1, 1)
     passed = saturate(config, action + disturbance) - action
@@ -125,7 +135,7 @@ def calibrate(
     statistics = ResidualStatistics(
         covariance, inflation[:, None, None, None], noise[:, None, None]
     )
-    free = replace(config, process_noise=None, inflation=None)
+    free = replace(config, process_noise=None, inflation=None, covariance="residuals")
     mean, variance = replay(free, residual, jacobian, action, statistics, len(tried))
     posterior = kalman.Posterior(mean, torch.diag_embed(variance))
     left = (kalman.significant(posterior, config.dead_zone) - disturbance) / half_range
@@ -180,7 +190,9 @@ def replay(
         posterior mean and variance after each step ``(C, S, T, m)``.
     """
     sequences, steps, n, m = jacobian.shape
-    state = init([candidates, sequences], n, m, config, dtype=residual.dtype)
+    state = init(
+        [candidates, sequences], n, m, config, dtype=residual.dtype, device=residual.device
+    )
     zero = torch.zeros_like(state.x_hat)
     # The first step starts the filter, and knows nothing yet.
     estimated = kalman_law.estimate(config, state, zero, statistics)

@@ -70,7 +70,9 @@ class Reach(NamedTuple):
         """For an executed input ``(..., m)`` and what is known of the disturbance."""
         mean = posterior.mean
         passed = saturate(config, executed + mean) - executed
-        margin = 1e-3 * like(mean, config.half_range)
+        # No smaller than rounding: actions without bounds may be large.
+        rounding = 64 * torch.finfo(mean.dtype).eps * (executed + mean).abs()
+        margin = 1e-3 * like(mean, config.half_range) + rounding
         above, below = (
             saturate(config, executed + mean + sign * margin) - executed for sign in (1, -1)
         )

@@ -246,7 +246,10 @@ def advance(
     action = required_entry(tensordict, action_key, owner)
     nested = tensordict.get(key, None)
     if nested is None or not isinstance(nested, TensorDictBase):
-        raise KeyError(f"{owner} found no state under {key!r}: {remedy}")
+        raise KeyError(
+            f"{owner} found no state under {key!r}: {remedy}, and let no transform rename or "
+            "remove it"
+        )
     entries = {name: nested.get(name, None) for name in names}
     seal = nested.get(SEAL, None) if check else None
     missing = [name for name, value in entries.items() if value is None]
@@ -295,7 +298,10 @@ def required_entry(tensordict: TensorDictBase, key: NestedKey, owner: str) -> Te
     value = tensordict.get(key, None)
     if value is None:
         found = sorted(map(str, tensordict.keys(include_nested=isinstance(key, tuple))))
-        raise KeyError(f"{owner} found no {key!r} in the tensordict, only {found}")
+        raise KeyError(
+            f"{owner} found no {key!r} in the tensordict, only {found}: where a transform has "
+            "renamed or removed it, keep it there or give the key that it has"
+        )
     return value
 
 

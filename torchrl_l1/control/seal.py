@@ -140,7 +140,9 @@ def _compare(
     scale = found.abs().amax(-1, keepdim=True).nan_to_num()
     if state is not None:
         actions = torch.cat([getattr(state, name).abs() for name in _IN_ACTION_UNITS], -1)
-        scale = torch.cat([actions.sum(-1, keepdim=True), state.x_hat.abs().sum(-1, True)], -1)
+        rest = [state.x_hat, *(value for value in state[6:] if value is not None)]
+        others = torch.cat([value.abs() for value in rest], -1)
+        scale = torch.cat([actions.sum(-1, keepdim=True), others.sum(-1, keepdim=True)], -1)
     off = (found[..., -2:] - seal[..., -2:]).abs() > 10 * _TOLERANCE * (1e-30 + scale)
     differs = torch.cat([differs[..., :-2], differs[..., -2:] & off], -1)
     if zero_is_none:

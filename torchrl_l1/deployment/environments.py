@@ -268,7 +268,7 @@ def _module(name: str) -> ModuleType:
     if not name.endswith(".py"):
         try:
             return import_module(name)
-        except ModuleNotFoundError as error:
+        except (ImportError, TypeError, ValueError) as error:
             raise ValueError(f"there is no module {name!r} ({error})") from None
     file = Path(name).resolve()
     if not file.exists():

@@ -153,10 +153,13 @@ def export(
     given = () if with_policy else (recorded["action"][:1],)
     example = (first, *given, *module.fresh.values())
     file.parent.mkdir(parents=True, exist_ok=True)
+    # Beside the file: what is there already stays if this one is no good.
+    beside = file.with_name(f".{file.stem}.tmp{file.suffix}")
     with torch.no_grad(), _quiet():
         try:
-            step = _WRITERS[format](module, example, file, inputs, outputs)
+            step = _WRITERS[format](module, example, beside, inputs, outputs)
         except Exception as error:  # of the tracers, anything
+            beside.unlink(missing_ok=True)
             if not with_policy:
                 raise
             why = next(iter(str(error).split("\n", 1)), "").strip() or type(error).__name__
@@ -168,11 +171,13 @@ def export(
     half = config.half_range
     allowed = tolerance * (min(half) if isinstance(half, tuple) else half)
     if not worst <= allowed:
+        beside.unlink(missing_ok=True)
         raise ValueError(
             f"{file} differs from the original by up to {worst:.3g} action units in {steps} steps, "
             f"and {allowed:.3g} are allowed: a policy that draws random numbers, or that is not "
             "made of torch's operations, cannot be exported (see with_policy, --without-policy)"
         )
+    beside.replace(file)
     return Exported(file, inputs, outputs, worst, steps)
 
 

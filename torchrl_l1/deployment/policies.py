@@ -198,8 +198,8 @@ def load_policy(
 
     Raises:
         FileNotFoundError: if there is no such file.
-        RuntimeError: if the weights are not those of the module.
-        ValueError: for a source that stands for nothing, a file beside it that changes what the
+        ValueError: if the weights are not those of the module, for a file that cannot be read, a
+            source that stands for nothing, a file beside it that changes what the
             policy sees and is not mentioned, or a policy that returns no action.
     """
     if normalization is not None and not (isinstance(policy, str) and policy.startswith("sb3:")):
@@ -217,10 +217,15 @@ def load_policy(
             stored = torch.load(weights, map_location="cpu", weights_only=True)
         except pickle.UnpicklingError:
             raise ValueError(
-                f"{weights} holds more than the tensors of a state dict, and loading that would "
-                "execute what is in it: save module.state_dict()"
+                f"{weights} is no state dict, or holds more than its tensors, and loading that "
+                "would execute what is in it: save module.state_dict()"
             ) from None
-        found.load_state_dict(stored)
+        except (EOFError, RuntimeError) as error:
+            raise ValueError(f"{weights} is no state dict: {_short(error)}") from error
+        try:
+            found.load_state_dict(stored)
+        except (RuntimeError, TypeError, AttributeError) as error:
+            raise ValueError(f"{weights} does not fit the policy: {_short(error)}") from error
     if isinstance(found, TensorDictModuleBase):
         return found
     if not callable(found):
@@ -229,14 +234,23 @@ def load_policy(
     return FunctionPolicy(found, observation, env.full_action_spec["action"])
 
 
+def _short(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
 def _from_source(source: str, normalization: str | None) -> Any:
     kind, _, rest = source.partition(":")
     if kind in _FILES and rest:
         if not Path(rest).is_file():
             raise FileNotFoundError(f"there is no file {rest}")
-        if kind == "sb3":
-            return _stable_baselines(Path(rest), normalization)
-        return _FILES[kind](rest)
+        try:
+            if kind == "sb3":
+                return _stable_baselines(Path(rest), normalization)
+            return _FILES[kind](rest)
+        except (ValueError, ImportError, FileNotFoundError):
+            raise
+        except Exception as error:  # of a foreign file, anything
+            raise ValueError(f"{rest} cannot be read as {kind}: {_short(error)}") from error
     if Path(source).is_dir():
         return list(load_run(source).algorithm.policies.values())[-1]
     if not rest:

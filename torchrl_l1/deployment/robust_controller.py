@@ -155,10 +155,10 @@ class RobustController:
         origin = dict(self.origin)
         kind, _, file = str(origin.get("policy") or "").partition(":")
         if kind in ("sb3", "torchscript", "onnx"):
-            origin["policy"] = f"{kind}:{_copied(Path(file), folder)}"
+            origin["policy"] = f"{kind}:{_copied(Path(file), folder, 'policy')}"
         for name in ("normalization", "weights"):
             if origin.get(name) and Path(origin[name]).is_file():
-                origin[name] = _copied(Path(origin[name]), folder)
+                origin[name] = _copied(Path(origin[name]), folder, name)
         stored = {
             "format": _FORMAT,
             "environment": self.source.name,
@@ -176,6 +176,7 @@ class RobustController:
         folder: str | Path,
         make_env: MakeEnv | None = None,
         policy: Policy | None = None,
+        trusted: bool = True,
     ) -> RobustController:
         """Read what :meth:`save` wrote.
 
@@ -183,21 +184,21 @@ class RobustController:
             folder: the folder.
             make_env: the environment; the one of the folder if ``None``.
             policy: the policy, likewise.
+            trusted: whether functions and pickles that the folder names may be run.
 
         Raises:
             FileNotFoundError: if there is no such folder.
+            ValueError: for a file that is damaged or of another version, or that is not to be
+                trusted and names what would be run.
             ValueError: if environment or policy were given as objects, which no folder holds, and
                 are not given again.
         """
         folder = Path(folder)
         if not (folder / _FILE).exists():
             raise FileNotFoundError(f"{folder} holds no controller: there is no {_FILE}")
-        stored = json.loads((folder / _FILE).read_text(encoding="utf-8"))
-        if stored["format"] != _FORMAT:
-            raise ValueError(
-                f"{folder / _FILE} has the format {stored['format']}, and this version reads "
-                f"{_FORMAT}: robustify the policy again"
-            )
+        stored, configs = _read(folder / _FILE)
+        if not trusted:
+            _check_runs_nothing(folder, stored)
         for what, value in (("make_env", make_env), ("policy", policy)):
             if value is None and not stored["environment" if what == "make_env" else what]:
                 raise ValueError(f"{folder} names no {what}, which was an object: give it again")
@@ -213,18 +214,45 @@ class RobustController:
             source,
             load_policy(policy, source.one(), **given),
             EnsembleDynamics.load(folder / _MODEL),
-            {name: L1Config(**values) for name, values in stored["configs"].items()},
+            configs,
             stored["preset"],
             {"policy": policy if isinstance(policy, str) else None, **given},
         )
 
 
-def _copied(file: Path, folder: Path) -> str:
-    """Put a copy of a file into a folder, unless it is that of the folder; its name."""
-    target = folder / file.name
+def _copied(file: Path, folder: Path, role: str) -> str:
+    """Put a copy of a file into a folder, unless it is that of the folder; its name there."""
+    # With its role, since files of different folders may have one name.
+    target = folder / (file.name if file.name.startswith(role) else f"{role}_{file.name}")
     if file.resolve() != target.resolve():
         shutil.copyfile(file, target)
-    return file.name
+    return target.name
+
+
+def _read(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
+    """What a controller's file holds, and its settings of L1."""
+    try:
+        stored = json.loads(file.read_text(encoding="utf-8"))
+        if stored["format"] == _FORMAT:
+            _ = stored["environment"], stored["policy"], stored["preset"]
+            return stored, {name: L1Config(**values) for name, values in stored["configs"].items()}
+    except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
+        raise ValueError(f"{file} is damaged ({error!r}): robustify the policy again") from error
+    raise ValueError(
+        f"{file} has the format {stored['format']!r}, and this version reads {_FORMAT}: robustify "
+        "the policy again"
+    )
+
+
+def _check_runs_nothing(folder: Path, stored: dict[str, Any]) -> None:
+    named = [stored["environment"], stored["policy"]]
+    data = ("torchscript", "onnx", "gymnasium", "dm_control")
+    for source in named:
+        kind = str(source or "").partition(":")[0]
+        if ":" in str(source or "") and kind not in data:
+            raise ValueError(
+                f"{folder} names {source!r}, which would be run: say --trust if the folder is yours"
+            )
 
 
 def _placed(name: str | None, folder: Path) -> str | None:
@@ -348,6 +376,7 @@ def load_target(
     policy: str | None = None,
     normalization: str | None = None,
     weights: str | None = None,
+    trusted: bool = False,
 ) -> RobustController:
     """What a command is about: a controller, a run, or a policy in its environment.
 
@@ -357,6 +386,7 @@ def load_target(
         policy: the policy in that environment, which then has no L1.
         normalization: see :func:`load_policy`.
         weights: likewise.
+        trusted: see :meth:`RobustController.load`.
 
     Raises:
         ValueError: if it is none of them, or a policy is given beside a folder.
@@ -367,7 +397,7 @@ def load_target(
             raise ValueError(f"{target} has a policy of its own: leave --policy out")
         for place in (folder, folder / "controller"):
             if (place / _FILE).exists():
-                return RobustController.load(place)
+                return RobustController.load(place, trusted=trusted)
         return _of_run(folder)
     if policy is None:
         raise ValueError(

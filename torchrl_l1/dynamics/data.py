@@ -72,6 +72,11 @@ def read_csv(
         >>> data["dt"][0].item()
         0.1
     """
+    observation, action = (
+        [names] if isinstance(names, str) else list(names) for names in (observation, action)
+    )
+    if not observation or not action:
+        raise ValueError("observation and action need the name of a column each")
     numbers = [*observation, *action, *([] if time is None else [time])]
     wanted = [*numbers, *([] if episode is None else [episode])]
     columns = _columns(path, wanted, numbers, delimiter)

@@ -333,6 +333,8 @@ def fit_dynamics(
     fraction, here = config.validation_fraction, torch.device(device or "cpu")
     keys = (observation_key, action_key)
     transitions = read_transitions(data, *keys, fraction, seed, torch.get_default_dtype(), here)
+    if not transitions.data.shape[0]:
+        raise ValueError("cannot fit: the data hold no transitions; collect some first")
     n, m = (transitions.data[key].shape[-1] for key in ("observation", "action"))
     entry_names(n, names, units)
     with torch.random.fork_rng(devices=[]):

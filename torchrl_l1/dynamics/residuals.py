@@ -61,6 +61,8 @@ class Residuals(nn.Module):
             raise ValueError("residuals have entries that are not finite: leave them out first")
         self.covariance.copy_(shrunk_covariance(residual))
         self.measured.fill_(True)
+        # It was of another model.
+        self.calibrated.fill_(False)
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
@@ -137,7 +139,8 @@ def calibrate_filter(
     observation, action = data["observation"][rows], data[action_key][rows]
     change, jacobian = value_and_jacobian(observation, action)
     residual = data["next", "observation"][rows] - observation - change
-    whole = residual.isfinite().flatten(1).all(1) & jacobian.isfinite().flatten(1).all(1)
+    parts = (residual, jacobian, action)
+    whole = torch.stack([part.isfinite().flatten(1).all(1) for part in parts]).all(0)
     if not whole.any():
         return None
     found = calibrate(
