@@ -157,7 +157,7 @@ class EvaluationSettings:
         episodes: episodes per cell.
         seed: seed of resets, noise and sampled actions.
         suite: name of a suite of disturbances, in place of values of them. With it, ``l1`` is
-            ``[off, paper, oracle]`` if it is not given.
+            ``[off, paper, robust, oracle]`` if it is not given.
     """
 
     name: str
