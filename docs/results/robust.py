@@ -3,8 +3,9 @@
     python docs/results/robust.py [FOLDER]
 
 Reads the tables that `torchrl-l1 evaluate` wrote into FOLDER/TASK/seed_N/bias and .../noise, if a
-FOLDER is given, and keeps their episodes in `robust/TASK.csv` beside this file, in place of those of
-the same policy. Writes from those `robust/TASK.md`, `robust/TASK.png`, `robust/overall.md` and `robust/harm.md`.
+FOLDER is given, and keeps their episodes in `robust/TASK.csv` beside this file, in place of those
+of the same policy. Writes from those `robust/TASK.md`, `robust/TASK.png`, `robust/overall.md` and
+`robust/harm.md`.
 """
 
 from __future__ import annotations
