@@ -33,10 +33,12 @@ Cell = tuple[str, float]
 # Returns of the episodes, by policy, controller and (disturbance, value).
 Returns = dict[tuple[str, str, Cell], np.ndarray]
 
-# A loss is worth speaking of from here, as a share of the undisturbed return; likewise what is
-# regained of it.
-LEAST_LOSS = 0.02
+# A change is worth speaking of from here, as a share of the undisturbed return or of the loss,
+# whichever is larger.
+LEAST = 0.02
 CANCELLED = 0.7
+# A pole that returns more than this stands still: what is left are thousandths of a radian.
+STANDING = 0.005
 
 
 def cell_of(row: dict[str, str]) -> Cell:
@@ -99,25 +101,27 @@ def regained(returns: Returns, l1: str, cells: Sequence[Cell]) -> Recovery:
 
 
 def change(returns: Returns, l1: str, cells: Sequence[Cell]) -> tuple[float, float, float]:
-    """Return less that without L1, as a share of the undisturbed one, with its 95 % interval."""
+    """Return less that without L1, as a share of its scale, with its 95 % interval."""
     on, off = (together(returns, one, cells) for one in (l1, "off"))
     zero = [np.zeros_like(one) for one in off]
     found = recovered(zero, zero, [a - b for a, b in zip(on, off, strict=True)])
-    scale, interval = undisturbed(returns), found.gap_interval
-    return found.gap / scale, interval.low / scale, interval.high / scale
+    size, interval = scale(returns, cells), found.gap_interval
+    return found.gap / size, interval.low / size, interval.high / size
 
 
-def undisturbed(returns: Returns) -> float:
-    """Magnitude of the undisturbed return without L1."""
-    return float(abs(np.mean(np.concatenate(together(returns, "off", [NONE])))))
+def scale(returns: Returns, cells: Sequence[Cell]) -> float:
+    """Magnitude of the undisturbed return without L1, or of the loss if that is larger."""
+    undisturbed = np.concatenate(together(returns, "off", [NONE])).mean()
+    disturbed = np.concatenate(together(returns, "off", cells)).mean()
+    return max(float(abs(undisturbed)), float(abs(undisturbed - disturbed)), STANDING)
 
 
 def verdict(returns: Returns, l1: str, cells: Sequence[Cell]) -> str:
     """What the controller does about a disturbance, in a word or two."""
     mean, low, high = change(returns, l1, cells)
-    if high < 0 and mean < -LEAST_LOSS:
+    if high < 0 and mean < -LEAST:
         return "worse"
-    if not (low > 0 and mean > LEAST_LOSS):
+    if not (low > 0 and mean > LEAST):
         return "not touched"
     back = regained(returns, l1, cells)
     whole = back.share is not None and back.gap > 0 and back.share >= CANCELLED
@@ -127,7 +131,6 @@ def verdict(returns: Returns, l1: str, cells: Sequence[Cell]) -> str:
 def table(returns: Returns, groups: Iterable[tuple[str, Sequence[Cell]]]) -> str:
     """One line for each group of cells."""
     lines = []
-    scale = undisturbed(returns)
     for words, cells in groups:
         off = float(np.mean(np.concatenate(together(returns, "off", cells))))
         line: dict[str, Any] = {"disturbance": words, "off": f"{off:.4g}"}
@@ -135,10 +138,14 @@ def table(returns: Returns, groups: Iterable[tuple[str, Sequence[Cell]]]) -> str
             on = float(np.mean(np.concatenate(together(returns, l1, cells))))
             line[l1] = f"{on:.4g}"
         loss = regained(returns, "off", cells)
-        line["loss, %"] = f"{100 * loss.gap / scale:.1f}" if cells[0] != NONE else ""
+        line["loss"] = f"{loss.gap:.4g}" if cells[0] != NONE else ""
         for l1 in CONTROLLERS:
             back = regained(returns, l1, cells) if cells[0] != NONE else None
-            shown = back is not None and back.share is not None and back.gap > LEAST_LOSS * scale
+            shown = (
+                back is not None
+                and back.share is not None
+                and back.gap > LEAST * scale(returns, cells)
+            )
             line[f"{l1} gives back"] = _share(back) if shown and back is not None else ""
         for l1 in ("paper", "robust"):
             line[f"{l1}:"] = verdict(returns, l1, cells)
@@ -182,7 +189,10 @@ def plot(of: dict[str, Returns], file: Path) -> None:
         ax.set_xticks(range(len(of)), tasks, rotation=30, ha="right")
         ax.set_yticks(range(len(names)), [DISTURBANCES[name].words for name in names])
     figure.colorbar(
-        image, ax=axes, label="change of the return, as a share of the undisturbed one", shrink=0.7
+        image,
+        ax=axes,
+        label="change of the return, as a share of the undisturbed one or of the loss",
+        shrink=0.7,
     )
     figure.savefig(file, dpi=110)
     plt.close(figure)
