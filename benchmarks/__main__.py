@@ -20,6 +20,7 @@ from benchmarks import (
     planning,
     planning_precision,
     shooting,
+    startup,
     trpo,
 )
 from benchmarks.tables import Table
@@ -41,6 +42,7 @@ BENCHMARKS: dict[str, tuple[int, int, Callable[[int], Table]]] = {
     "imagination": (imagination.THREADS, 9, imagination.table),
     "trpo": (trpo.THREADS, 15, trpo.table),
     "metrpo_iteration": (metrpo_iteration.THREADS, 5, metrpo_iteration.table),
+    "startup": (startup.THREADS, 5, startup.table),
 }
 
 
