@@ -30,8 +30,8 @@ from torchrl_l1.control import L1Config
 from torchrl_l1.envs import DISTURBANCES, TASKS, gymnasium_id
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import available_campaigns, available_recipes, recipes_dir
-from torchrl_l1.experiment.run import MODES
 from torchrl_l1.experiment.settings import SCHEMAS, L1Settings, flatten
+from torchrl_l1.experiment.tracking import MODES
 
 ROOT = Path(__file__).parents[1]
 SNIPPETS = [

@@ -12,6 +12,7 @@ import math
 import sys
 import zlib
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -148,7 +149,7 @@ def problems(run_dir: Path, most: int = 10) -> list[str]:
         found.append(f"{files[-1].path.parent.name} has no end")
     rows = [row for file in files for row in file.history]
     steps = [row["_step"] for row in rows]
-    if any(later <= earlier for earlier, later in zip(steps, steps[1:], strict=False)):
+    if any(later <= earlier for earlier, later in pairwise(steps)):
         found.append(f"steps do not rise: {steps}")
     rows = [row for row in rows if "iteration" in row]
     iterations = [row["iteration"] for row in rows]

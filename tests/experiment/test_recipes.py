@@ -263,6 +263,10 @@ NEWER = {"fit.precision": "float32", "precision": "float32"} | {
 }
 NEWER |= {
     "on_divergence": "stop",
+    "loggers": ["wandb"],
+    "checkpoint": {"every": None, "best": False},
+    **dict.fromkeys(("wandb.entity", "wandb.group", "wandb.name", "wandb.notes")),
+    "wandb.tags": [],
     "l1.estimator": "least_squares",
     "l1.filter": "low_pass",
     "l1.covariance": "residuals",
