@@ -141,7 +141,7 @@ def test_recipes_page_has_every_key_of_the_controller() -> None:
 
 def test_a_recipe_of_the_page_composes(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
-    file.write_text(block("docs/recipes.md", "yaml", "defaults:\n  - /pets/"))
+    file.write_text(block("docs/recipes.md", "yaml", "defaults: [pets/"))
     mine = compose(str(file), ["preset=paper", "run_dir=unused"])
     assert (mine.recipe, mine.task, mine.cem.candidates) == ("mine", "half_cheetah", 300)
     assert mine.cem.horizon == 30 and mine.model.head == "gaussian"

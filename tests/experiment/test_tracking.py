@@ -11,6 +11,7 @@ import pytest
 from omegaconf import DictConfig
 
 from tests.wandb_files import problems, wandb_files
+from tests.wandb_server import wandb_server
 from torchrl_l1.campaign.description import read_campaign
 from torchrl_l1.campaign.plan import plan
 from torchrl_l1.cli import main
@@ -197,3 +198,77 @@ def test_tensorboard_that_is_not_installed_is_a_line(
     monkeypatch.setattr("torchrl_l1.experiment.tracking.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install 'torchrl-l1\[tensorboard\]'"):
         run(tiny_recipe("loggers=[tensorboard]"))
+
+
+def test_wandb_sync_makes_one_run_of_what_kills_and_evaluations_have_left(
+    tiny_recipe: Recipe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_dir = run(tiny_recipe(OFFLINE))
+    assert not settled(run_dir)
+    cut(newest(run_dir), 1)
+    main(["evaluate", str(run_dir), "--episodes", "2", "--bias", "0", "--l1", "off"])
+    run(tiny_recipe(OFFLINE, "outer_iterations=3", "resume=true"))
+    assert not settled(run_dir)
+    with wandb_server() as server:
+        monkeypatch.setenv("WANDB_BASE_URL", server.url)
+        monkeypatch.setenv("WANDB_API_KEY", 40 * "a")
+        command = [sys.executable, "-m", "wandb", "sync", *map(str, run_dir.glob("wandb/offline*"))]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+    ((drawn, lines),) = server.history.items()
+    assert drawn == known_id(run_dir)
+    shown = [lines[number] for number in sorted(lines)]
+    assert [row["_step"] for row in shown] == [0, 1, 2, 3]
+    assert ["evaluation" in row for row in shown] == [False, False, True, False]
+    with (run_dir / "metrics.csv").open() as file:
+        for row, logged in zip(csv.DictReader(file), shown[:2] + shown[3:], strict=True):
+            assert {name: float(value) for name, value in row.items()} == {
+                name: float(logged[name]) for name in row
+            }
+    assert any(name.endswith(".table.json") for name in server.media)
+
+
+def test_a_run_that_is_logged_online_is_completed_when_it_goes_on(
+    tiny_recipe: Recipe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with wandb_server() as server:
+        monkeypatch.setenv("WANDB_BASE_URL", server.url)
+        monkeypatch.setenv("WANDB_API_KEY", 40 * "a")
+        run_dir = run(tiny_recipe("wandb.mode=online", "wandb.name=arm"))
+        drawn = str(known_id(run_dir))
+        assert server.settings[drawn]["displayName"] == "arm"
+        # The last row has not arrived, and the file has lost it too.
+        del server.history[drawn][1]
+        server.summaries[drawn] = {**server.history[drawn][0]}
+        cut(newest(run_dir), 1)
+        run(tiny_recipe("wandb.mode=online", "wandb.name=arm", "resume=true"))
+        run(tiny_recipe("wandb.mode=online", "outer_iterations=3", "resume=true"))
+    assert list(server.history) == [drawn]
+    steps = [(row["_step"], row["iteration"]) for row in server.history[drawn].values()]
+    assert steps == [(0, 0), (1, 1), (2, 2)]
+
+
+def test_kills_at_random_moments_lose_nothing(
+    tmp_path: Path, tiny_overrides: list[str], start_cli: Callable[..., Any]
+) -> None:
+    """Of processes that are forked; ``python -m tests.kills`` does it with whole ones."""
+    settings = [*tiny_overrides, OFFLINE, "outer_iterations=4", "fit.max_epochs=100"]
+    folder = tmp_path / "run"
+    command = ["run", "metrpo/inverted_pendulum", *settings, f"run_dir={folder}", "--resume"]
+    rng = random.Random(0)
+    for rows in (0, 1, 3):
+        process = start_cli(command)
+        while process.poll() is None and not logged(folder, rows):
+            time.sleep(0.005)
+        time.sleep(rng.uniform(0, 0.3))
+        process.kill()
+        process.wait()
+    assert start_cli(command).wait(timeout=300) == 0
+    assert not settled(folder)
+    assert len(wandb_files(folder)) > 1
+
+
+def logged(folder: Path, rows: int) -> bool:
+    file = folder / "metrics.csv"
+    begun = any(folder.glob("wandb/offline-run-*/*.wandb"))
+    return begun and (not rows or (file.exists() and len(file.read_text().splitlines()) > rows))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from wandb.proto import wandb_internal_pb2
 
@@ -82,9 +82,10 @@ def lines() -> tuple[list[str], Any]:
     return said, said.append
 
 
-records = st.lists(st.binary(max_size=70_000), max_size=4)
+records = st.lists(st.binary(max_size=40_000), max_size=3)
 
 
+@settings(max_examples=30)
 @given(records)
 def test_what_is_written_is_read(content: list[bytes]) -> None:
     raw = framed(content)
@@ -94,6 +95,7 @@ def test_what_is_written_is_read(content: list[bytes]) -> None:
         assert found[-1][1] == len(raw)
 
 
+@settings(max_examples=50)
 @given(records, st.data())
 def test_of_a_cut_or_damaged_file_the_first_records_are_read(
     content: list[bytes], data: st.DataObject

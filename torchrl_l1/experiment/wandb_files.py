@@ -119,7 +119,10 @@ def _read(path: Path) -> WandbFile:
         elif kind == "exit":
             found.ended = True
         elif kind == "history":
-            items = {item.key: json.loads(item.value_json) for item in record.history.item}
+            items = {
+                "/".join(item.nested_key) or item.key: json.loads(item.value_json)
+                for item in record.history.item
+            }
             found.history.append({"_step": record.history.step.num, **items})
         found.end = end
     return found
