@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import csv
+import random
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from omegaconf import DictConfig
@@ -212,7 +216,8 @@ def test_wandb_sync_makes_one_run_of_what_kills_and_evaluations_have_left(
     with wandb_server() as server:
         monkeypatch.setenv("WANDB_BASE_URL", server.url)
         monkeypatch.setenv("WANDB_API_KEY", 40 * "a")
-        command = [sys.executable, "-m", "wandb", "sync", *map(str, run_dir.glob("wandb/offline*"))]
+        files = map(str, run_dir.glob("wandb/offline-run-*"))
+        command = [sys.executable, "-m", "wandb", "sync", *files]
         done = subprocess.run(command, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
     ((drawn, lines),) = server.history.items()
