@@ -1,12 +1,14 @@
 """Kills at random moments: whether every run goes on, to the bit, and its loggers hold all of it.
 
 ``python -m tests.kills [KILLS] [SEED] [FOLDER]`` kills METRPO, PETS, MBMF and a campaign in turn,
-each once at a moment that is drawn, and starts it again. Every second kill takes W&B's own process
-as well, as a power cut does. It prints a table, and ends with status 1 if anything is lost.
+each once at a moment that is drawn, and starts it again. Of every eight kills the last four take
+W&B's own process as well, as a power cut does. It prints a table, and ends with status 1 if
+anything is lost. Processes are forked from one that has loaded the package, where that can be done.
 """
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import random
 import signal
@@ -21,6 +23,7 @@ from pathlib import Path
 
 import yaml
 
+from tests.conftest import HAS_FORKS, PRELOADED, Forked, Process, started_anew
 from tests.wandb_files import problems
 
 METRPO = [
@@ -69,18 +72,10 @@ def command(kind: str, folder: Path) -> list[str]:
     return ["run", recipe, *settings, "wandb.mode=offline", f"run_dir={folder}", "--resume"]
 
 
-def start(kind: str, folder: Path) -> subprocess.Popen[bytes]:
-    """Start it in a session of its own; what it says is beside its folder."""
-    arguments = [sys.executable, "-m", "torchrl_l1.cli", *command(kind, folder)]
-    with folder.with_suffix(".log").open("ab") as log:
-        return subprocess.Popen(
-            arguments,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1", "WANDB_SILENT": "true"},
-        )
+def start(kind: str, folder: Path) -> Process:
+    """Start it; what it says is beside its folder."""
+    starter = Forked if HAS_FORKS else started_anew
+    return starter(command(kind, folder), folder.with_suffix(".log"))
 
 
 def run_directories(folder: Path) -> list[Path]:
@@ -99,13 +94,13 @@ def begun(folder: Path) -> bool:
     return any(folder.rglob("config.yaml"))
 
 
-def wait_until_begun(process: subprocess.Popen[bytes], folder: Path) -> None:
+def wait_until_begun(process: Process, folder: Path) -> None:
     """Until the first run directory is there, or the process has ended."""
     while process.poll() is None and not begun(folder):
         time.sleep(0.01)
 
 
-def ended_well(process: subprocess.Popen[bytes]) -> bool:
+def ended_well(process: Process) -> bool:
     """Wait for a process."""
     try:
         return process.wait(PATIENCE) == 0
@@ -114,10 +109,23 @@ def ended_well(process: subprocess.Popen[bytes]) -> bool:
         return False
 
 
-def kill(process: subprocess.Popen[bytes], everything: bool) -> None:
-    """SIGKILL to a process, and to all of its session if asked."""
-    with suppress(ProcessLookupError):
-        (os.killpg if everything else os.kill)(process.pid, signal.SIGKILL)
+def descendants(pid: int) -> list[int]:
+    """The processes that one has started, and those that these have, where Linux tells."""
+    found = []
+    with suppress(OSError):
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            for child in (task / "children").read_text().split():
+                found += [int(child), *descendants(int(child))]
+    return found
+
+
+def kill(process: Process, everything: bool) -> None:
+    """SIGKILL to a process, and to all that it has started if asked."""
+    others = descendants(process.pid) if everything else []
+    process.kill()
+    for pid in others:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
     process.wait()
 
 
@@ -177,6 +185,10 @@ def attack(kills: int, seed: int, root: Path, kinds: tuple[str, ...] = KINDS) ->
         root: folder of all that is written.
         kinds: that are killed.
     """
+    if HAS_FORKS:
+        multiprocessing.get_context("forkserver").set_forkserver_preload(
+            [*PRELOADED, __spec__.name]
+        )
     outcome, rng = Kills(), random.Random(seed)
     expected, seconds = {}, {}
     for kind in kinds[:kills]:
