@@ -45,7 +45,9 @@ _HYDRA_SETTINGS = [
     "hydra.sweep.subdir=.",
     "hydra/job_logging=disabled",
     "hydra/hydra_logging=disabled",
-    f"hydra.job.config.override_dirname.exclude_keys=[{','.join(_IN_NO_NAME)}]",
+    # The project stays where it was: directories of older runs are found again.
+    "hydra.job.config.override_dirname.exclude_keys="
+    f"[{','.join(key for key in _IN_NO_NAME if key != 'wandb.project')}]",
 ]
 
 _FLAGS_WITH_VALUE = (
