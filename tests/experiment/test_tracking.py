@@ -110,12 +110,12 @@ def test_evaluations_go_to_the_run_and_the_training_goes_on(
     training, evaluation, more = wandb_files(run_dir)
     assert {file.runs[0].run_id for file in (training, evaluation, more)} == {drawn}
     (row,) = evaluation.history
-    assert row["evaluation"]["_type"] == "table-file"
-    assert row["evaluation/robustness"]["_type"] == "image-file"
+    assert row["evaluation/_type"] == "table-file"
+    assert row["evaluation/robustness/_type"] == "image-file"
     assert [row["_step"] for row in more.history] == [3]
     folder = evaluation.path.parent / "files"
     for name in ("evaluation", "evaluation/robustness"):
-        assert (folder / row[name]["path"]).is_file()
+        assert (folder / row[f"{name}/path"]).is_file()
 
 
 def test_nothing_of_wandb_where_it_is_not_wanted(tiny_recipe: Recipe, tmp_path: Path) -> None:
