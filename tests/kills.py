@@ -1,9 +1,9 @@
 """Kills at random moments: whether every run goes on, to the bit, and its loggers hold all of it.
 
-``python -m tests.kills [KILLS] [SEED] [FOLDER]`` kills METRPO, PETS, MBMF and a campaign in turn,
-each once at a moment that is drawn, and starts it again. Of every eight kills the last four take
-W&B's own process as well, as a power cut does. It prints a table, and ends with status 1 if
-anything is lost. Processes are forked from one that has loaded the package, where that can be done.
+``python -m tests.kills [KILLS] [SEED] [FOLDER] [KIND ...]`` kills METRPO, PETS, MBMF and a campaign
+in turn, each once at a moment that is drawn, and starts it again. In every second round W&B's own
+process is killed as well, as by a power cut. It prints a table, and ends with status 1 if anything
+is lost. Processes are forked from one that has loaded the package, where that can be done.
 """
 
 from __future__ import annotations
@@ -220,11 +220,11 @@ def attack(kills: int, seed: int, root: Path, kinds: tuple[str, ...] = KINDS) ->
 
 
 def main(arguments: list[str]) -> int:
-    """Entry point: kills, seed and folder, each of which may be left out."""
-    kills, seed, folder, *_ = [*arguments, *("20", "0", "")[len(arguments) :]]
+    """Entry point: kills, seed, folder and kinds, each of which may be left out."""
+    kills, seed, folder, *kinds = [*arguments, *("20", "0", "")[len(arguments) :]]
     root = Path(folder or tempfile.mkdtemp())
     root.mkdir(parents=True, exist_ok=True)
-    outcome = attack(int(kills), int(seed), root)
+    outcome = attack(int(kills), int(seed), root, tuple(kinds) or KINDS)
     print(outcome)
     return 1 if outcome.lines else 0
 
