@@ -196,10 +196,14 @@ def _check_defaults(recipe: Path, texts: Any) -> None:
         content = yaml.safe_load(yaml_text(recipe))
     except yaml.YAMLError:
         return  # Hydra says what is wrong with it
-    for entry, text in zip(content.get("defaults") or [], texts or [], strict=True):
-        for key, value in entry.items() if isinstance(entry, dict) else ():
+    entries = content.get("defaults")
+    if not (isinstance(entries, list) and isinstance(texts, list)):
+        return
+    for entry, text in zip(entries, texts, strict=False):
+        if not (isinstance(entry, dict) and isinstance(text, dict)):
+            continue
+        for value, (key, word) in zip(entry.values(), text.items(), strict=False):
             if isinstance(value, bool):
-                word = text[str(key)]
                 raise RecipeError(
                     f"{recipe}: defaults: {key}: {word} means {str(value).lower()} in YAML; write "
                     f"{key}: '{word}'"
@@ -270,7 +274,8 @@ def _name(recipe: Path, overrides: Sequence[str]) -> list[str]:
     except (yaml.YAMLError, OSError, ValueError, RecursionError):
         return []  # Hydra says what is wrong with it
     named = not isinstance(content, dict) or "recipe" in content
-    return [] if named else [f"recipe='{recipe.stem}'"]
+    stem = recipe.stem.replace("'", "\\'")
+    return [] if named else [f"recipe='{stem}'"]
 
 
 def _search_path(recipe: Path) -> list[str]:
