@@ -111,7 +111,7 @@ def _read(path: Path) -> WandbFile:
 
     found = WandbFile(path)
     for raw, end in whole_records(path.read_bytes()):
-        record = wandb_internal_pb2.Record.FromString(raw)
+        record = wandb_internal_pb2.Record.FromString(raw)  # type: ignore[attr-defined]
         kind = record.WhichOneof("record_type")
         if kind == "run" and found.start is None:
             time = record.run.start_time
