@@ -186,9 +186,8 @@ def attack(kills: int, seed: int, root: Path, kinds: tuple[str, ...] = KINDS) ->
         kinds: that are killed.
     """
     if HAS_FORKS:
-        multiprocessing.get_context("forkserver").set_forkserver_preload(
-            [*PRELOADED, __spec__.name]
-        )
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload([*PRELOADED, "tests.conftest", "tests.wandb_files"])
     outcome, rng = Kills(), random.Random(seed)
     expected, seconds = {}, {}
     for kind in kinds[:kills]:

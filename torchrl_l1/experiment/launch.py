@@ -16,6 +16,7 @@ import yaml  # type: ignore[import-untyped]
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import IntervalSweep
 from hydra.errors import CompactHydraException, HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -154,9 +155,12 @@ def _first(overrides: Sequence[str]) -> list[str]:
     found = []
     for text, override in zip(overrides, parser.parse_overrides(list(overrides)), strict=True):
         if override.is_sweep_override():
-            # A sweeper of its own chooses from an interval.
-            interval = override.value() if override.is_interval_sweep() else None
-            values = [interval.start] if interval else list(override.sweep_string_iterator())
+            interval = override.value()
+            # Some sweepers choose from an interval; others refuse it when they run.
+            if isinstance(interval, IntervalSweep):
+                values = [str(interval.start)]
+            else:
+                values = list(override.sweep_string_iterator())
             if not values:
                 raise RecipeError(f"{text} matches nothing, so there is nothing to run")
             text = f"{override.get_key_element()}={values[0]}"
