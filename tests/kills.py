@@ -89,14 +89,15 @@ def results(folder: Path) -> dict[str, bytes]:
     return {str(file.relative_to(folder)): file.read_bytes() for file in files}
 
 
-def begun(folder: Path) -> bool:
-    """Whether a run has begun; before that there is nothing to lose."""
-    return any(folder.rglob("config.yaml"))
+def rows(folder: Path) -> int:
+    """Outer iterations that are complete in all runs; -1 where none has begun."""
+    tables = [file.read_bytes().count(b"\n") - 1 for file in folder.rglob("metrics.csv")]
+    return sum(tables) if any(folder.rglob("config.yaml")) else -1
 
 
-def wait_until_begun(process: Process, folder: Path) -> None:
-    """Until the first run directory is there, or the process has ended."""
-    while process.poll() is None and not begun(folder):
+def wait_for(process: Process, folder: Path, count: int) -> None:
+    """Until so many outer iterations are complete, or the process has ended."""
+    while process.poll() is None and rows(folder) < count:
         time.sleep(0.01)
 
 
@@ -122,7 +123,8 @@ def descendants(pid: int) -> list[int]:
 def kill(process: Process, everything: bool) -> None:
     """SIGKILL to a process, and to all that it has started if asked."""
     others = descendants(process.pid) if everything else []
-    process.kill()
+    with suppress(ProcessLookupError):  # it has ended meanwhile
+        process.kill()
     for pid in others:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
@@ -149,6 +151,7 @@ class Kills:
     Attributes:
         tried: kills, by kind.
         early: those that came before any outer iteration was complete.
+        late: those that came when all were, in evaluations or while loggers were closed.
         resumed: runs that ended well after the kill.
         same: those with the results of the unbroken run.
         logged: those of which W&B's files hold every step once.
@@ -157,6 +160,7 @@ class Kills:
 
     tried: Counter[str] = field(default_factory=Counter)
     early: Counter[str] = field(default_factory=Counter)
+    late: Counter[str] = field(default_factory=Counter)
     resumed: Counter[str] = field(default_factory=Counter)
     same: Counter[str] = field(default_factory=Counter)
     logged: Counter[str] = field(default_factory=Counter)
@@ -164,16 +168,17 @@ class Kills:
 
     def __str__(self) -> str:
         """A table in Markdown."""
-        columns = (self.tried, self.early, self.resumed, self.same, self.logged)
-        rows = [
-            "| | kills | before the first row | resumed | results to the bit | W&B complete |",
-            "|---|---|---|---|---|---|",
+        columns = (self.tried, self.early, self.late, self.resumed, self.same, self.logged)
+        lines = [
+            "| | kills | before the first row | after the last | went on | same to the bit "
+            "| W&B complete |",
+            "|---|---|---|---|---|---|---|",
         ]
         for kind in KINDS:
             if self.tried[kind]:
-                rows.append(f"| {kind} | " + " | ".join(str(c[kind]) for c in columns) + " |")
+                lines.append(f"| {kind} | " + " | ".join(str(c[kind]) for c in columns) + " |")
         total = " | ".join(str(c.total()) for c in columns)
-        return "\n".join([*rows, f"| all | {total} |", *self.lines])
+        return "\n".join([*lines, f"| all | {total} |", *self.lines])
 
 
 def attack(kills: int, seed: int, root: Path, kinds: tuple[str, ...] = KINDS) -> Kills:
@@ -189,32 +194,34 @@ def attack(kills: int, seed: int, root: Path, kinds: tuple[str, ...] = KINDS) ->
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload([*PRELOADED, "tests.conftest", "tests.wandb_files"])
     outcome, rng = Kills(), random.Random(seed)
-    expected, seconds = {}, {}
+    expected, iteration = {}, {}
     for kind in kinds[:kills]:
         folder = root / f"{kind}_unbroken"
         process = start(kind, folder)
-        wait_until_begun(process, folder)
+        wait_for(process, folder, 0)
         first = time.monotonic()
         if not ended_well(process):
             raise RuntimeError(f"{kind} does not run at all, see {folder.with_suffix('.log')}")
-        seconds[kind] = time.monotonic() - first
+        iteration[kind] = (time.monotonic() - first) / rows(folder)
         expected[kind] = results(folder)
     for number in range(kills):
         kind = kinds[number % len(kinds)]
-        folder = root / f"{kind}_{number}"
-        moment = rng.uniform(0, seconds[kind])
+        folder, every = root / f"{kind}_{number}", rows(root / f"{kind}_unbroken")
+        # Counted in rows, since seconds are others when the machine is busy.
+        count, moment = rng.randint(0, every), rng.uniform(0, iteration[kind])
         process = start(kind, folder)
-        wait_until_begun(process, folder)
+        wait_for(process, folder, count)
         with suppress(subprocess.TimeoutExpired):
             process.wait(moment)
         kill(process, everything=number // len(kinds) % 2 == 1)
         outcome.tried[kind] += 1
-        outcome.early[kind] += not run_directories(folder)
+        outcome.early[kind] += rows(folder) < 1
+        outcome.late[kind] += rows(folder) == every
         outcome.resumed[kind] += (well := ended_well(start(kind, folder)))
         lines = lost(folder, expected[kind]) if well else ["did not go on"]
         outcome.same[kind] += not any("differs" in line for line in lines) and well
         outcome.logged[kind] += not any("W&B" in line for line in lines) and well
-        outcome.lines += [f"{folder}, killed after {moment:.2f} s: {line}" for line in lines]
+        outcome.lines += [f"{folder}, {moment:.2f} s after row {count}: {line}" for line in lines]
     return outcome
 
 

@@ -13,14 +13,18 @@ from typing import Any
 
 import pytest
 from omegaconf import DictConfig
+from PIL import Image
 from wandb.proto import wandb_internal_pb2
 
+import wandb
 from tests.wandb_files import problems, wandb_files
 from tests.wandb_server import wandb_server
 from torchrl_l1.campaign.description import read_campaign
 from torchrl_l1.campaign.plan import plan
 from torchrl_l1.cli import main
+from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.run import run
+from torchrl_l1.experiment.tracking import Evaluated, log_evaluation
 from torchrl_l1.experiment.wandb_files import ID_FILE, known_id, whole_records
 
 Recipe = Callable[..., DictConfig]
@@ -210,12 +214,16 @@ def test_wandb_sync_makes_one_run_of_what_kills_and_evaluations_have_left(
     run_dir = run(tiny_recipe(OFFLINE))
     assert not settled(run_dir)
     cut(newest(run_dir), 1)
-    main(["evaluate", str(run_dir), "--episodes", "2", "--bias", "0", "--l1", "off"])
+    recipe = load_run(run_dir).recipe
+    chart = run_dir.with_name("chart.png")
+    Image.new("RGB", (8, 8)).save(chart)
+    log_evaluation(recipe, run_dir, Evaluated("evaluation", [], [chart]))
     run(tiny_recipe(OFFLINE, "outer_iterations=3", "resume=true"))
     assert not settled(run_dir)
     with wandb_server() as server:
         monkeypatch.setenv("WANDB_BASE_URL", server.url)
         monkeypatch.setenv("WANDB_API_KEY", 40 * "a")
+        monkeypatch.delenv("WANDB_SERVICE", raising=False)  # the process of these tests
         files = map(str, run_dir.glob("wandb/offline-run-*"))
         command = [sys.executable, "-m", "wandb", "sync", *files]
         done = subprocess.run(command, capture_output=True, text=True)
@@ -224,13 +232,13 @@ def test_wandb_sync_makes_one_run_of_what_kills_and_evaluations_have_left(
     assert drawn == known_id(run_dir)
     shown = [lines[number] for number in sorted(lines)]
     assert [row["_step"] for row in shown] == [0, 1, 2, 3]
-    assert ["evaluation" in row for row in shown] == [False, False, True, False]
+    assert ["evaluation/chart" in row for row in shown] == [False, False, True, False]
     with (run_dir / "metrics.csv").open() as file:
         for row, logged in zip(csv.DictReader(file), shown[:2] + shown[3:], strict=True):
             assert {name: float(value) for name, value in row.items()} == {
                 name: float(logged[name]) for name in row
             }
-    assert any(name.endswith(".table.json") for name in server.media)
+    assert any(name.startswith("media/images/evaluation/chart") for name in server.media)
 
 
 def test_a_run_that_is_logged_online_is_completed_when_it_goes_on(
@@ -239,6 +247,7 @@ def test_a_run_that_is_logged_online_is_completed_when_it_goes_on(
     with wandb_server() as server:
         monkeypatch.setenv("WANDB_BASE_URL", server.url)
         monkeypatch.setenv("WANDB_API_KEY", 40 * "a")
+        wandb.teardown()  # it reads its settings once
         run_dir = run(tiny_recipe("wandb.mode=online", "wandb.name=arm"))
         drawn = str(known_id(run_dir))
         assert server.settings[drawn]["displayName"] == "arm"
@@ -248,6 +257,7 @@ def test_a_run_that_is_logged_online_is_completed_when_it_goes_on(
         cut(newest(run_dir), 1)
         run(tiny_recipe("wandb.mode=online", "wandb.name=arm", "resume=true"))
         run(tiny_recipe("wandb.mode=online", "outer_iterations=3", "resume=true"))
+        wandb.teardown()
     assert list(server.history) == [drawn]
     steps = [(row["_step"], row["iteration"]) for row in server.history[drawn].values()]
     assert steps == [(0, 0), (1, 1), (2, 2)]

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import wandb
-
 from torchrl_l1.checks import check_choice
 from torchrl_l1.experiment.errors import RunDirectoryError, message
 from torchrl_l1.experiment.files import locked, refuse_link
@@ -160,6 +159,7 @@ class WandbTracker(Tracker):
         say: Callable[[str], object] = print,
     ) -> None:
         held, settings = take_over(run_dir, metrics, say), recipe.wandb
+        self._say, self._failed = say, False
         self._held: Mapping[int, Row] = held.rows
         self._next_step = held.next_step
         try:
@@ -206,15 +206,21 @@ class WandbTracker(Tracker):
         if number in self._held:
             return
         step = max(self._next_step, number)
-        # What is not committed waits in memory for the next step, and is lost in a kill.
-        self._run.log(_values(metrics, timing), step=step, commit=True)
+        try:
+            # What is not committed waits in memory for the next step, and is lost in a kill.
+            self._run.log(_values(metrics, timing), step=step, commit=True)
+        # Of a process of W&B's that has died there is no common class.
+        except Exception as error:
+            if not self._failed:
+                self._say(f"W&B: {message(error) or type(error).__name__}; --resume logs the rest")
+            self._failed = True
         self._next_step = step + 1
 
     def evaluation(self, evaluated: Evaluated) -> None:
         """Log a table, charts and films under the evaluation's name."""
         columns: list[str | int] = list(evaluated.columns)
         cells = [[row.get(str(key)) for key in columns] for row in evaluated.rows]
-        shown: dict[str, Any] = {evaluated.name: wandb.Table(columns, cells)}
+        shown: dict[str, Any] = {evaluated.name: wandb.Table(columns, cells)} if cells else {}
         for picture in evaluated.pictures:
             film = picture.suffix in (".gif", ".mp4")
             media = wandb.Video(str(picture)) if film else wandb.Image(str(picture))
@@ -225,6 +231,8 @@ class WandbTracker(Tracker):
     def close(self, status: int = 0) -> None:
         """Flush and close."""
         file = Path(self._run.settings.sync_file)
+        if self._failed:
+            return
         self._run.finish(exit_code=status)
         # W&B's own process may write the last records a little later.
         deadline = time.monotonic() + _PATIENCE
