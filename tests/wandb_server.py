@@ -44,7 +44,8 @@ class WandbServer(ThreadingHTTPServer):
         run = str(variables.get("name") or variables.get("run"))
         project = {"id": "p", "name": "p", "entity": {"id": "e", "name": "lab"}}
         if operation == "UpsertBucket":
-            self.settings[run] = {**self.settings.get(run, {}), **variables}
+            given = {key: value for key, value in variables.items() if value is not None}
+            self.settings[run] = {**self.settings.get(run, {}), **given}
             self.history.setdefault(run, {})
             bucket = {
                 **{"id": run, "name": run, "displayName": "x", "description": "", "config": "{}"},

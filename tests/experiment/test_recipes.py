@@ -219,12 +219,12 @@ def test_a_users_own_recipe_may_include_a_shipped_one(tmp_path: Path) -> None:
 
 def test_a_users_own_recipe_inherits_a_shipped_one_by_a_line(tmp_path: Path) -> None:
     own = tmp_path / "mine.yaml"
-    own.write_text("defaults: [dets/half_cheetah]\nparticles: 7\n")
+    own.write_text("defaults: [dets/half_cheetah, _self_]\nparticles: 7\n")
     recipe = composed(str(own), "preset=paper", "l1=off")
     assert isinstance(recipe, PETSRecipe)
     assert (recipe.recipe, recipe.task, recipe.particles) == ("mine", "half_cheetah", 7)
     assert recipe.model.head == "deterministic" and not recipe.l1.enabled
-    own.write_text("defaults: [metrpo/hopper, {override l1: 'off'}]\n")
+    own.write_text("defaults: [metrpo/hopper, {override l1: 'off'}, _self_]\n")
     assert not typed(str(own)).l1.enabled
     assert typed(str(own), "recipe=other").recipe == "other"
 

@@ -133,6 +133,12 @@ def _check(recipe: Path, overrides: Sequence[str], sweeps: bool, trusted: bool) 
     except (yaml.YAMLError, RecursionError, OverflowError, TypeError) as error:
         raise RecipeError(f"{recipe}, or what it includes: {problem(error)}") from error
     check_known(config)
+    for text in overrides:
+        if "interval(" in text and config.hydra.sweeper._target_.endswith(".BasicSweeper"):
+            raise RecipeError(
+                f"{text}: only a sweeper such as hydra/sweeper=optuna chooses from an interval; "
+                "name values, or give that sweeper"
+            )
 
 
 @contextmanager
@@ -156,7 +162,7 @@ def _first(overrides: Sequence[str]) -> list[str]:
     for text, override in zip(overrides, parser.parse_overrides(list(overrides)), strict=True):
         if override.is_sweep_override():
             interval = override.value()
-            # Some sweepers choose from an interval; others refuse it when they run.
+            # A sweeper chooses from an interval; what lies at its start will do here.
             if isinstance(interval, IntervalSweep):
                 values = [str(interval.start)]
             else:
