@@ -30,8 +30,8 @@ from torchrl_l1.control import L1Config
 from torchrl_l1.envs import DISTURBANCES, TASKS, gymnasium_id
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import available_campaigns, available_recipes, recipes_dir
-from torchrl_l1.experiment.run import MODES
 from torchrl_l1.experiment.settings import SCHEMAS, L1Settings, flatten
+from torchrl_l1.experiment.tracking import MODES
 
 ROOT = Path(__file__).parents[1]
 SNIPPETS = [
@@ -141,7 +141,7 @@ def test_recipes_page_has_every_key_of_the_controller() -> None:
 
 def test_a_recipe_of_the_page_composes(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
-    file.write_text(block("docs/recipes.md", "yaml", "defaults:\n  - /pets/"))
+    file.write_text(block("docs/recipes.md", "yaml", "defaults: [pets/"))
     mine = compose(str(file), ["preset=paper", "run_dir=unused"])
     assert (mine.recipe, mine.task, mine.cem.candidates) == ("mine", "half_cheetah", 300)
     assert mine.cem.horizon == 30 and mine.model.head == "gaussian"

@@ -24,12 +24,13 @@ from torchrl_l1.campaign.description import (
 from torchrl_l1.compilation import check_mode
 from torchrl_l1.envs import get_task
 from torchrl_l1.experiment.errors import USER_ERRORS, RunDirectoryError, message
+from torchrl_l1.experiment.files import bounded
 from torchrl_l1.experiment.l1_options import check_tested
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import group_setting
-from torchrl_l1.experiment.run import check_wandb_mode
 from torchrl_l1.experiment.run_directory import RunDirectory
 from torchrl_l1.experiment.settings import SCHEMAS, RunSettings, check_known, l1_config
+from torchrl_l1.experiment.tracking import check_loggers
 
 
 @dataclass
@@ -189,13 +190,11 @@ def _runs(index: int, matrix: RunMatrix, output: Path, trusted: bool) -> Iterato
             own = config.copy()
             own.seed = seed
             own.run_dir = str(folder / f"seed_{seed}")
-            yield PlannedRun(
-                {"recipe": recipe_name(recipe), **cell, "seed": str(seed)},
-                index,
-                round_,
-                RunDirectory(own.run_dir),
-                own,
-            )
+            values = {"recipe": recipe_name(recipe), **cell, "seed": str(seed)}
+            run = PlannedRun(values, index, round_, RunDirectory(own.run_dir), own)
+            if own.wandb.name is None:
+                own.wandb.name = bounded(str(run))
+            yield run
 
 
 def _check(config: DictConfig) -> None:
@@ -205,7 +204,7 @@ def _check(config: DictConfig) -> None:
     get_task(recipe.task)
     l1_config(recipe.l1, recipe.task)
     check_mode(recipe.l1.compile, "l1.compile")
-    check_wandb_mode(recipe.wandb.mode)
+    check_loggers(recipe)
 
 
 def check_devices(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:

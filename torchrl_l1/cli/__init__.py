@@ -8,6 +8,8 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
+from torchrl_l1._version import __version__
+
 DESCRIPTION = "Robust model-based reinforcement learning with L1 adaptive control."
 
 _TRUST = "let the file set up Hydra itself, which may run any code"
@@ -38,6 +40,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the console script. Exits with status 1 on a refused request."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser("torchrl-l1", description=DESCRIPTION)
+    parser.add_argument("--version", action="version", version=f"torchrl-l1 {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _run_parser(commands)
     _campaign_parser(commands)
@@ -53,7 +56,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     verify.add_argument("traces", help="an .npz file of recorded traces")
     verify.add_argument("--tolerance", type=float, default=1e-9, help="largest error allowed")
-    commands.add_parser("recipes", help="list the shipped recipes and campaigns")
+    recipes = commands.add_parser("recipes", help="list or copy the shipped recipes and campaigns")
+    recipes.add_argument(
+        "--copy",
+        nargs="+",
+        metavar=("NAME", "FILE"),
+        help="write a copy to edit: of a recipe or campaign, to NAME.yaml or a file of your choice",
+    )
 
     options, rest = parser.parse_known_args(arguments)
     overridden = options.command == "campaign" and not any(o.startswith("-") for o in rest)
@@ -93,9 +102,7 @@ def _dispatch(options: argparse.Namespace, rest: list[str]) -> None:
             if not verify_command(options.traces, options.tolerance):
                 sys.exit(1)
         else:
-            from torchrl_l1.experiment.recipes import available_campaigns, available_recipes
-
-            print("\n".join([*available_recipes(), "", "Campaigns:", *available_campaigns()]))
+            _recipes(options.copy)
         sys.stdout.flush()  # while a broken pipe can still be named
     except USER_ERRORS as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
@@ -174,6 +181,23 @@ def _report_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]
     add("dir", nargs="+", help="folders of runs, such as runs/campaigns/NAME")
     add("--output", help="folder of the results; DIR/report by default")
     add("--reference-curves", metavar="FILE", help="a CSV of the authors' curves to draw behind")
+
+
+def _recipes(copy: Sequence[str] | None) -> None:
+    from torchrl_l1.experiment.recipes import (
+        available_campaigns,
+        available_recipes,
+        copy_recipe,
+    )
+
+    if copy is None:
+        print("\n".join([*available_recipes(), "", "Campaigns:", *available_campaigns()]))
+        return
+    if len(copy) > 2:
+        raise ValueError(f"--copy takes a NAME and perhaps a FILE, got {' '.join(copy)}")
+    file = copy_recipe(*copy)
+    command = "campaign" if copy[0] in available_campaigns() else "run"
+    print(f"{file} is yours: torchrl-l1 {command} {file}")
 
 
 def _run(options: argparse.Namespace, overrides: list[str]) -> None:

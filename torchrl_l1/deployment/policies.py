@@ -21,6 +21,7 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase
 
 from torchrl_l1.deployment.environments import load_attribute, require
+from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
 
 Policy: TypeAlias = str | TensorDictModuleBase | nn.Module | Callable[[Tensor], Any]
@@ -251,7 +252,7 @@ def _from_source(source: str, normalization: str | None) -> Any:
             raise
         except Exception as error:  # of a foreign file, anything
             raise ValueError(f"{rest} cannot be read as {kind}: {_short(error)}") from error
-    if Path(source).is_dir():
+    if Path(source).is_dir() or (kept_by(Path(source)) and Path(source).is_file()):
         return list(load_run(source).algorithm.policies.values())[-1]
     if not rest:
         raise ValueError(f"unknown policy {source!r}; policies are {_FORMS}")

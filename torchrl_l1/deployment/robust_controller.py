@@ -33,6 +33,7 @@ from torchrl_l1.deployment.learning import (
 )
 from torchrl_l1.deployment.policies import Policy, load_policy
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, calibrate_filter, fit_dynamics
+from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.files import write_atomically
 from torchrl_l1.experiment.l1_options import OFF, closest_option, l1_option
@@ -398,6 +399,8 @@ def load_target(
         for place in (folder, folder / "controller"):
             if (place / _FILE).exists():
                 return RobustController.load(place, trusted=trusted)
+        return _of_run(folder)
+    if kept_by(folder) and folder.is_file():
         return _of_run(folder)
     if policy is None:
         raise ValueError(

@@ -25,7 +25,7 @@ from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import calibrate_filter
 from torchrl_l1.dynamics.fit import one_step_residuals
 from torchrl_l1.envs import DISTURBANCES, Perturbation
-from torchrl_l1.experiment.checkpoints import load_state
+from torchrl_l1.experiment.checkpoints import KEPT, kept_by, load_state
 from torchrl_l1.experiment.errors import RunDirectoryError, message
 from torchrl_l1.experiment.l1_options import (
     closest_option,
@@ -40,11 +40,24 @@ from torchrl_l1.experiment.settings import L1Settings, RunSettings, l1_config, s
 
 @dataclass
 class TrainedRun:
-    """A finished or running training, loaded for evaluation."""
+    """A finished or running training, loaded for evaluation.
+
+    Attributes:
+        path: the run directory.
+        recipe: its settings.
+        algorithm: with the state of a checkpoint.
+        checkpoint: name of a kept one; empty for the last.
+    """
 
     path: Path
     recipe: RunSettings
     algorithm: Algorithm
+    checkpoint: str = ""
+
+    @property
+    def name(self) -> str:
+        """As users name it: the run directory, or the file of the kept checkpoint."""
+        return str(self.path / KEPT / f"{self.checkpoint}.pt" if self.checkpoint else self.path)
 
     def stage(self, name: str | None) -> str:
         """The name of a stage that the run has reached; of the last one if ``None``.
@@ -67,16 +80,20 @@ def load_run(path: str | Path, *, last: bool = False) -> TrainedRun:
     """Load recipe, model and policy of a run directory.
 
     Args:
-        path: the directory.
+        path: the directory, or one of the checkpoints that it keeps, such as
+            ``RUN_DIR/checkpoints/best.pt``.
         last: whether the checkpoint before the last one will not do where that cannot be read.
 
     Raises:
         RunDirectoryError: if the directory holds no run, or no checkpoint that can be read.
     """
-    directory = RunDirectory(path)
+    kept = kept_by(Path(path))
+    directory = RunDirectory(path if kept is None else kept)
     if not directory.config_file.exists():
-        raise RunDirectoryError(f"{path} holds no run: there is no {directory.config_file.name}")
-    checkpoint = directory.load_checkpoint()
+        raise RunDirectoryError(
+            f"{directory.path} holds no run: there is no {directory.config_file.name}"
+        )
+    checkpoint = directory.load_checkpoint() if kept is None else directory.load_kept(Path(path))
     if checkpoint is not None and last and not directory.last_is_good:
         raise RunDirectoryError(
             f"{directory.checkpoint_file} cannot be read; resume the run, which makes it again"
@@ -91,7 +108,7 @@ def load_run(path: str | Path, *, last: bool = False) -> TrainedRun:
     state = checkpoint["algorithm"]
     load_state(algorithm, {**state, "buffer": {}}, directory.checkpoint_file)
     _measure_residuals(algorithm, state.get("buffer", {}), recipe)
-    return TrainedRun(directory.path, recipe, algorithm)
+    return TrainedRun(directory.path, recipe, algorithm, Path(path).stem if kept else "")
 
 
 def _recipe(directory: RunDirectory) -> RunSettings:
@@ -180,7 +197,7 @@ def evaluate_episodes(
         collection = make_collection(trained, cell, episodes)
         data = collection.evaluate(seed, deterministic=cell.policy == "deterministic")
         place = {
-            "run": str(trained.path),
+            "run": trained.name,
             "training_seed": trained.recipe.seed,
             **_columns(trained, cell),
         }

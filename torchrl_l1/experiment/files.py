@@ -165,13 +165,33 @@ def write_atomically(file: Path, content: str | bytes, keep: Path | None = None)
         raise type(error)(error.errno, error.strerror, str(file)) from error
 
 
-def _keep(file: Path, at: Path) -> None:
+def copy_in_place(file: Path, at: Path) -> None:
+    """Make a copy of a file that is replaced as a whole and never changed; it takes no room.
+
+    Raises:
+        RunDirectoryError: if the copy's folder is a link.
+        OSError: with the name of the copy.
+    """
+    refuse_link(at.parent)
+    try:
+        if at.exists() and os.path.samefile(file, at):
+            return
+        at.parent.mkdir(exist_ok=True)
+        _keep(file, at, moved=False)
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(at)) from error
+
+
+def _keep(file: Path, at: Path, moved: bool = True) -> None:
     second = at.with_name(at.name + ".tmp")
     second.unlink(missing_ok=True)
     try:
         os.link(file, second)
     except OSError:  # a file system without hard links
-        os.replace(file, at)
+        if moved:
+            os.replace(file, at)
+        else:
+            write_atomically(at, file.read_bytes())
     else:
         os.replace(second, at)
 

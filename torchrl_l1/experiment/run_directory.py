@@ -294,6 +294,16 @@ class RunDirectory:
             say(f"{problems[0]}; the run starts over")
         return state
 
+    def load_kept(self, file: Path) -> dict[str, Any]:
+        """A checkpoint that the run has kept.
+
+        Raises:
+            RunDirectoryError: if it cannot be read, or is of another configuration.
+        """
+        state = read_checkpoint(file)
+        self._check_checkpoint(file, state, self._stored(), lambda line: None)
+        return state
+
     def _has_results(self) -> bool:
         names = (*_TABLES, *_WEIGHTS)
         return any((self.path / n).exists() and (self.path / n).stat().st_size for n in names)

@@ -86,10 +86,33 @@ class WandbSettings:
         mode: ``auto`` (online when logged in, else offline), ``online``, ``offline``,
             ``disabled``.
         project: name of the project.
+        entity: user or team; W&B's default if null.
+        group: that the run belongs to.
+        name: of the run; recipe, what differs from it, and seed if null.
+        tags: words to find it by.
+        notes: a longer text.
     """
 
     mode: str = "auto"
     project: str = "torchrl_l1"
+    entity: str | None = None
+    group: str | None = None
+    name: str | None = None
+    tags: list[str] = field(default_factory=list)
+    notes: str | None = None
+
+
+@dataclass
+class CheckpointSettings:
+    """Checkpoints that are kept, beside the last one and the one before it.
+
+    Attributes:
+        every: outer iterations after which one is kept, again and again; none if null.
+        best: whether that of the highest ``return_mean`` is kept.
+    """
+
+    every: int | None = None
+    best: bool = False
 
 
 @dataclass
@@ -108,9 +131,11 @@ class RunSettings(ABC):
         device: ``cpu``, ``cuda`` or ``auto`` (CUDA where there is one).
         horizon: steps per real episode; the task's own if null.
         on_divergence: ``stop`` or ``warn`` where losses, weights or plans are no longer finite.
+        loggers: of ``wandb`` and ``tensorboard``; none if empty.
         l1: see :class:`L1Settings`.
         perturbation: noise and disturbances of the real environment.
         wandb: see :class:`WandbSettings`.
+        checkpoint: see :class:`CheckpointSettings`.
     """
 
     algorithm: str = MISSING
@@ -124,9 +149,11 @@ class RunSettings(ABC):
     device: str = "cpu"
     horizon: int | None = None
     on_divergence: str = "stop"
+    loggers: list[str] = field(default_factory=lambda: ["wandb"])
     l1: L1Settings = field(default_factory=L1Settings)
     perturbation: Perturbation = field(default_factory=Perturbation)
     wandb: WandbSettings = field(default_factory=WandbSettings)
+    checkpoint: CheckpointSettings = field(default_factory=CheckpointSettings)
 
     builds: ClassVar[type[Algorithm]]
 
@@ -150,6 +177,7 @@ class RunSettings(ABC):
         check_count("threads", self.threads)
         check_optional_count("horizon", self.horizon)
         check_choice("on_divergence", self.on_divergence, ("stop", "warn"))
+        check_optional_count("checkpoint.every", self.checkpoint.every)
 
     @abstractmethod
     def collected_episodes(self, iterations: int) -> int:
@@ -184,7 +212,7 @@ class RunSettings(ABC):
 OmegaConf.register_new_resolver("bounded", bounded_overrides, replace=True)
 
 # Keys that may differ between a run and its continuation: they do not touch the result.
-VOLATILE_KEYS = ("run_dir", "resume", "wandb", "on_divergence")
+VOLATILE_KEYS = ("run_dir", "resume", "wandb", "on_divergence", "loggers", "checkpoint")
 
 
 def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
