@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import wandb
 from omegaconf import DictConfig
 from PIL import Image
 from wandb.proto import wandb_internal_pb2
 
-import wandb
 from tests.wandb_files import problems, wandb_files
 from tests.wandb_server import wandb_server
 from torchrl_l1.campaign.description import read_campaign

@@ -14,6 +14,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig
+from torchrl_l1.algorithms.outcomes import Outcomes
 from torchrl_l1.algorithms.policy import GaussianPolicy, make_actor
 from torchrl_l1.dynamics import EnsembleDynamics, imagine
 from torchrl_l1.envs import StartStates, Task
@@ -49,16 +50,23 @@ class PolicyImprovement:
     """TRPO steps of a policy in a learned model (arXiv 1802.10592).
 
     Args:
-        task: rewards, start states and action bounds.
+        task: start states and action bounds.
         dynamics: the model.
         policy: changed in place, on the model's device.
         config: settings.
+        outcomes: rewards and ends of what is imagined.
     """
 
     def __init__(
-        self, task: Task, dynamics: EnsembleDynamics, policy: GaussianPolicy, config: METRPOConfig
+        self,
+        task: Task,
+        dynamics: EnsembleDynamics,
+        policy: GaussianPolicy,
+        config: METRPOConfig,
+        outcomes: Outcomes,
     ) -> None:
         self.task, self.dynamics, self.policy, self.config = task, dynamics, policy, config
+        self.outcomes = outcomes
         self.device = next(policy.parameters()).device
         self.baseline = LinearFeatureBaseline(task.observation_dim).to(self.device)
         self.start_states = StartStates(task)
@@ -73,12 +81,12 @@ class PolicyImprovement:
         trajectories = imagine(
             self.dynamics,
             self.policy.sampler(),
-            self.task.imagined_reward,
+            self.outcomes.reward,
             self.starts(config.imagined_steps // config.imagined_horizon, buffer),
             config.imagined_horizon,
             self.action_low,
             self.action_high,
-            self.task.terminated if config.imagined_termination else None,
+            self.outcomes.terminated(self.task.terminated if config.imagined_termination else None),
             precision=config.precision,  # type: ignore[arg-type]
         )
         observation, step = trajectories["observation"], trajectories["step"]

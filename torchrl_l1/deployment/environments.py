@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeAlias
 
@@ -39,6 +36,7 @@ from torchrl_l1.envs import (
     disturbance_transforms,
     disturbed_model,
     get_task,
+    load_module,
     make_env,
 )
 
@@ -200,7 +198,7 @@ def environment_source(env: MakeEnv) -> EnvironmentSource:
     if first == "dm_control":
         return _of_dm_control(env, rest)
     module, _, name = env.partition(":")
-    if name.isidentifier() and (found := _attribute(module, name)) is not None:
+    if name.isidentifier() and (found := getattr(load_module(module), name, None)) is not None:
         return EnvironmentSource(env, found)
     if name or env in gymnasium.registry:
         return _of_gymnasium(env, env)
@@ -245,41 +243,6 @@ def require(module: str, extra: str) -> ModuleType:
         raise ValueError(
             f"{module} cannot be imported ({error}): pip install 'torchrl-l1[{extra}]'"
         ) from None
-
-
-def load_attribute(name: str) -> Any:
-    """What ``MODULE:NAME`` or ``FILE.py:NAME`` names.
-
-    Raises:
-        ValueError: if there is none.
-    """
-    module, _, attribute = name.partition(":")
-    found = _attribute(module, attribute)
-    if found is None:
-        raise ValueError(f"{module} has no {attribute!r}")
-    return found
-
-
-def _attribute(module: str, name: str) -> Any:
-    return getattr(_module(module), name, None)
-
-
-def _module(name: str) -> ModuleType:
-    if not name.endswith(".py"):
-        try:
-            return import_module(name)
-        except (ImportError, TypeError, ValueError) as error:
-            raise ValueError(f"there is no module {name!r} ({error})") from None
-    file = Path(name).resolve()
-    if not file.exists():
-        raise ValueError(f"there is no file {name}")
-    spec = importlib.util.spec_from_file_location(file.stem, file)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # As of an import: what the file defines may look its own module up.
-    sys.modules.setdefault(file.stem, module)
-    spec.loader.exec_module(module)
-    return module
 
 
 def vector_environment(env: EnvBase) -> EnvBase:

@@ -20,7 +20,8 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase
 
-from torchrl_l1.deployment.environments import load_attribute, require
+from torchrl_l1.deployment.environments import require
+from torchrl_l1.envs import load_attribute
 from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
 

@@ -30,6 +30,7 @@ from torchrl_l1.envs.perturbations import (
     suite,
 )
 from torchrl_l1.envs.plant import disturbed_model, wind_force
+from torchrl_l1.envs.references import load_attribute, load_module
 from torchrl_l1.envs.sensors import SensorBias, SensorDelay, SensorDropout
 from torchrl_l1.envs.simulation import BatchedSimulator, StartStates, TaskSimulation
 from torchrl_l1.envs.task import Task
@@ -70,6 +71,8 @@ __all__ = [
     "disturbed_model",
     "get_task",
     "gymnasium_id",
+    "load_attribute",
+    "load_module",
     "make_env",
     "register_tasks",
     "suite",

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import wandb
+
 from torchrl_l1.checks import check_choice
 from torchrl_l1.experiment.errors import RunDirectoryError, message
 from torchrl_l1.experiment.files import locked, refuse_link
