@@ -1,9 +1,9 @@
-"""The full suite of disturbances on frozen policies: off, the paper's, the robust one, the oracle.
+"""The suite of disturbances on frozen policies: off, the paper's, the robust one, the oracle.
 
     python docs/results/suite.py [FOLDER]
 
-Reads the episodes that `torchrl-l1 evaluate --suite full` wrote into FOLDER/TASK/seed_N, if a
-FOLDER is given, and keeps their returns in `suite/TASK.csv` beside this file, in place of those of
+Reads the episodes that `torchrl-l1 evaluate --suite quick` (or `full`) wrote into
+FOLDER/TASK/seed_N, if a FOLDER is given, and keeps their returns in `suite/TASK.csv` beside this file, in place of those of
 the same policy. Writes from those `suite/TASK.md`, one row per disturbance, `suite/TASK_values.md`,
 one row per value of it, and `suite/verdicts.md` and `.png`, disturbances by tasks.
 """
@@ -20,7 +20,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import TwoSlopeNorm
 
-from torchrl_l1.envs import DISTURBANCES, suite
+from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.files import write_table
 from torchrl_l1.report.page import markdown
 from torchrl_l1.report.statistics import Recovery, recovered
@@ -159,14 +159,10 @@ def _share(found: Recovery) -> str:
 
 
 def groups_of(returns: Returns) -> dict[str, list[Cell]]:
-    """The cells that were tested of each disturbance, in the order of the suite."""
+    """The cells that were tested of each disturbance, in the order of the registry."""
     tested = {key[2] for key in returns}
-    groups: dict[str, list[Cell]] = {}
-    for values in suite("full"):
-        for name, value in values.items():
-            if (name, float(value)) in tested:
-                groups.setdefault(name, []).append((name, float(value)))
-    return groups
+    groups = {name: sorted(cell for cell in tested if cell[0] == name) for name in DISTURBANCES}
+    return {name: cells for name, cells in groups.items() if cells}
 
 
 def plot(of: dict[str, Returns], file: Path) -> None:
