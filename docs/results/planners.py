@@ -1,4 +1,4 @@
-"""PETS and MBMF on the pendulum with an actuator bias: off, the paper's, the robust one, the oracle.
+"""PETS and MBMF on the pendulum with an actuator bias, under all controllers and the oracle.
 
     python docs/results/planners.py [FOLDER]
 
