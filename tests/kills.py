@@ -222,6 +222,8 @@ def attack(kills: int, seed: int, root: Path, kinds: tuple[str, ...] = KINDS) ->
         outcome.same[kind] += not any("differs" in line for line in lines) and well
         outcome.logged[kind] += not any("W&B" in line for line in lines) and well
         outcome.lines += [f"{folder}, {moment:.2f} s after row {count}: {line}" for line in lines]
+        print(f"{number + 1} of {kills}: {folder.name}, {'; '.join(lines) or 'nothing lost'}")
+        sys.stdout.flush()
     return outcome
 
 
