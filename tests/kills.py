@@ -86,7 +86,9 @@ def run_directories(folder: Path) -> list[Path]:
 def results(folder: Path) -> dict[str, bytes]:
     """What must be the same to the bit: metrics and evaluations."""
     files = [*folder.rglob("metrics.csv"), *folder.rglob("evaluations/episodes/*.csv")]
-    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+    # Evaluations name the run directory.
+    here = str(folder).encode()
+    return {str(file.relative_to(folder)): file.read_bytes().replace(here, b"") for file in files}
 
 
 def rows(folder: Path) -> int:
