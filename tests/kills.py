@@ -86,7 +86,9 @@ def run_directories(folder: Path) -> list[Path]:
 def results(folder: Path) -> dict[str, bytes]:
     """What must be the same to the bit: metrics and evaluations."""
     files = [*folder.rglob("metrics.csv"), *folder.rglob("evaluations/episodes/*.csv")]
-    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+    # Evaluations name the run directory.
+    here = str(folder).encode()
+    return {str(file.relative_to(folder)): file.read_bytes().replace(here, b"") for file in files}
 
 
 def rows(folder: Path) -> int:
@@ -222,6 +224,8 @@ def attack(kills: int, seed: int, root: Path, kinds: tuple[str, ...] = KINDS) ->
         outcome.same[kind] += not any("differs" in line for line in lines) and well
         outcome.logged[kind] += not any("W&B" in line for line in lines) and well
         outcome.lines += [f"{folder}, {moment:.2f} s after row {count}: {line}" for line in lines]
+        print(f"{number + 1} of {kills}: {folder.name}, {'; '.join(lines) or 'nothing lost'}")
+        sys.stdout.flush()
     return outcome
 
 
