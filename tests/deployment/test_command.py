@@ -4,8 +4,10 @@ import csv
 import shlex
 
 import pytest
+import wandb
 
 from torchrl_l1.cli import main
+from torchrl_l1.envs import suite
 
 TINY = ["--steps", "300", "--episodes", "2", "--most-steps", "15"]
 
@@ -68,3 +70,37 @@ def test_from_a_policy_to_a_controller_that_python_loads(policy_file, tmp_path, 
 def test_refusals_of_one_line(line, message, capsys, monkeypatch):
     monkeypatch.setenv("DISPLAY", ":0")
     assert message in refused(shlex.split(line), capsys)
+
+
+@pytest.mark.filterwarnings("ignore:the model is too poor")
+def test_a_suite_with_what_weights_and_biases_is_told(policy_file, tmp_path, monkeypatch):
+    told: dict[str, object] = {}
+
+    class Run:
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            told["ended"] = error
+
+        def log(self, values):
+            told.update(values)
+
+    def init(**options):
+        told["options"] = options
+        return Run()
+
+    monkeypatch.setattr(wandb, "init", init)
+    output = tmp_path / "out"
+    policy = f"{policy_file}:balance"
+    main(["robustify", "inverted_pendulum", "--policy", policy, "--suite", "quick",
+          *TINY, "--wandb", "offline", "--output", str(output)])  # fmt: skip
+    with (output / "evaluation.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    cells = len(suite("quick"))
+    assert len([row for row in rows if row["l1"] == "off"]) == cells
+    # Where a disturbance is not matched there is nothing that an oracle could be told.
+    assert 0 < len([row for row in rows if row["l1"] == "oracle"]) < cells
+    assert told["options"]["mode"] == "offline" and told["options"]["config"]["suite"] == "quick"
+    assert len(told["evaluation"].data) == len(rows) and told["chart"] is not None
+    assert told["ended"] == (None, None, None)

@@ -23,6 +23,7 @@ from torchrl_l1.control.pipeline import (
     check_order,
     check_time_step,
     unspecified,
+    warn_of_surroundings,
     widen_selection,
 )
 from torchrl_l1.control.seal import SEAL, Emitted, sealed
@@ -325,6 +326,9 @@ class L1Transform(Transform):
         config = self._settings.complete(parent)
         if self.check_dt:
             check_time_step("L1Transform", config.dt, parent)
+        bounds = config.action_low, config.action_high
+        spec = layout.low, layout.high
+        warn_of_surroundings("L1Transform", parent, self.observation_key, bounds, spec)
         config = layout.bounded(config)
         if self._step_function is None or config != self._step_config:
             self._step_function = make_step(config, self.model, self.compile_mode, self.diagnostics)
