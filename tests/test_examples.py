@@ -11,6 +11,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import gymnasium
 import pytest
 
 import torchrl_l1
@@ -75,17 +76,44 @@ def test_at_most_eight_lines(name: str) -> None:
 
 @pytest.mark.filterwarnings("ignore:the model is too poor")
 def test_sac_of_torchrl(small: list[Any], tmp_path: Path, capsys) -> None:
-    load(tmp_path / "torchrl_sac_training.py").train("sac.pt", 300, random_steps=150)
-    assert str(small and small[0]) in run("torchrl_sac", capsys)
+    load(tmp_path / "torchrl_sac_training.py").train("sac.pt", 300, random_steps=200)
+    printed = run("torchrl_sac", capsys)
+    assert str(small[0]) in printed
     assert {row["bias"] for row in small[0]} == {0.0, 0.25, 0.5, 1.0}
 
 
-@pytest.mark.filterwarnings("ignore:the model is too poor")
-@pytest.mark.filterwarnings("ignore::UserWarning:gymnasium")
-def test_a_clone_of_a_minari_dataset(small: list[Any], tmp_path: Path, capsys) -> None:
+def record_without_jax(name: str, episodes: int, steps: int) -> None:
+    """What `record` of the script does with Minari's DataCollector, which needs jax."""
+    import minari
+    from minari.data_collector.episode_buffer import EpisodeBuffer
+
+    env, buffers = gymnasium.make("InvertedPendulum-v5", max_episode_steps=steps), []
+    env.action_space.seed(0)
+    for episode in range(episodes):
+        seen, rows, done = [env.reset(seed=episode)[0]], [], False
+        while not done:
+            action = env.action_space.sample()
+            following, reward, terminated, truncated, _ = env.step(action)
+            seen.append(following)
+            rows.append((action, reward, terminated, truncated))
+            done = terminated or truncated
+        columns = [list(column) for column in zip(*rows, strict=True)]
+        buffers.append(EpisodeBuffer(episode, None, None, seen, *columns, {}))
+    minari.create_dataset_from_buffers(name, buffers, env=env, algorithm_name="random")
+
+
+@pytest.mark.filterwarnings("ignore")  # Minari's, of metadata and folders, and a poor model's
+@pytest.mark.parametrize("recorded", [True, False], ids=["by its collector", "without jax"])
+def test_a_clone_of_a_minari_dataset(
+    recorded: bool, small: list[Any], tmp_path: Path, capsys
+) -> None:
     pytest.importorskip("minari")
     making = load(tmp_path / "minari_clone_data.py")
-    making.record(episodes=4, steps=60)
+    if recorded:
+        pytest.importorskip("jax")
+        making.record(episodes=4, steps=60)
+    else:
+        record_without_jax(making.DATASET, 30, 60)
     making.clone(epochs=2)
     assert "| bias 1 |" in run("minari_clone", capsys)
 

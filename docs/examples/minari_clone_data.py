@@ -3,7 +3,7 @@
     python minari_clone_data.py
 
 Writes the dataset `pendulum/balanced-v0`, where Minari keeps its own, and `clone.pt`. Needs the
-extra `minari`; half a minute.
+extra `minari` and `minari[create]`; half a minute.
 """
 
 import gymnasium

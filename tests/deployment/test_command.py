@@ -94,7 +94,8 @@ def test_a_suite_with_what_weights_and_biases_is_told(policy_file, tmp_path, mon
     output = tmp_path / "out"
     policy = f"{policy_file}:balance"
     main(["robustify", "inverted_pendulum", "--policy", policy, "--suite", "quick",
-          *TINY, "--wandb", "offline", "--output", str(output)])  # fmt: skip
+          "--steps", "300", "--episodes", "1", "--most-steps", "4",
+          "--wandb", "offline", "--output", str(output)])  # fmt: skip
     with (output / "evaluation.csv").open() as file:
         rows = list(csv.DictReader(file))
     cells = len(suite("quick"))

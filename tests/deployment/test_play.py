@@ -100,7 +100,8 @@ def watching(monkeypatch, count: int) -> list[int]:
         play.pyplot.close(figure)
 
     monkeypatch.setattr(play, "FuncAnimation", Watched)
-    monkeypatch.setattr(play.pyplot, "switch_backend", lambda backend: None)
+    switch = play.pyplot.switch_backend
+    monkeypatch.setattr(play.pyplot, "switch_backend", lambda backend: switch("Agg"))
     monkeypatch.setattr(play.pyplot, "show", look)
     return seen
 

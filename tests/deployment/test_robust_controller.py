@@ -72,7 +72,7 @@ def test_recorded_data_take_the_place_of_collected_ones(form):
     torch.manual_seed(0)
 
     def explore(x: torch.Tensor) -> torch.Tensor:
-        return balance(x) + torch.randn(*x.shape[:-1], 1)
+        return balance(x.float()) + torch.randn(*x.shape[:-1], 1)
 
     policy = TensorDictModule(explore, ["observation"], ["action"])
     # Of float64, and with the resets of episodes that end.

@@ -135,6 +135,7 @@ class L1Transform(Transform):
         self.diagnostics = diagnostics
         self.dtype = self.model.dtype if dtype is None else dtype
         self._layout: Layout | None = None
+        self._zero: TensorDictBase | None = None
         self._is_ready = self._is_stateful = False
         self._step_config: L1Config | None = None
         self._step_function: StepFunction | None = None
@@ -169,7 +170,7 @@ class L1Transform(Transform):
         super().empty_cache()
 
     def _forget(self) -> None:
-        self._layout = None
+        self._layout = self._zero = None
         self._emitted = self._consumed = None
         self._lacking = None
 
@@ -292,8 +293,12 @@ class L1Transform(Transform):
             )
 
     def _fresh(self, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        config = self._settings.config
-        fresh = self._resolve().zero(tensordict_reset.batch_size, config, self.diagnostics)
+        batch_size = tensordict_reset.batch_size
+        if self._zero is None or self._zero.batch_size != batch_size:
+            # Kept, since some environment of a batch is reset at every other step.
+            config = self._settings.config
+            self._zero = self._resolve().zero(batch_size, config, self.diagnostics)
+        fresh = self._zero.clone()
         self._seal(fresh, tensordict_reset.get(self.observation_key))
         return fresh
 
@@ -315,7 +320,7 @@ class L1Transform(Transform):
             self.model.check_dimensions(*dimensions)
             # An environment with its state in the tensordict may step from any state, also twice.
             self._is_stateful = not list(parent.base_env.full_state_spec.keys(True, True))
-            self._layout, self._is_ready = layout, False
+            self._layout, self._is_ready, self._zero = layout, False, None
         return self._layout
 
     def _complete(self) -> None:
@@ -365,6 +370,7 @@ class L1Transform(Transform):
         empty = {
             "_step_function": None,
             "_layout": None,
+            "_zero": None,
             "_emitted": None,
             "_consumed": None,
             "_lacking": None,
