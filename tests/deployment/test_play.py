@@ -108,7 +108,7 @@ def watching(monkeypatch, count: int) -> list[int]:
 
 @pytest.mark.parametrize(("dt", "every", "interval"), [(0.04, 1, 40), (0.005, 4, 20)])
 def test_a_window_shows_the_film_in_real_time(monkeypatch, dt, every, interval):
-    seen = watching(monkeypatch, 6)
+    seen = watching(monkeypatch, 5)
     frames = [np.full((60, 200, 3), 10 * k, np.uint8) for k in range(20)]
     play.show_film(frames, dt, "pendulum")
     # The first frame is drawn twice, by the canvas and as the animation begins.

@@ -134,7 +134,8 @@ def pack(
     entries["u_exec"] = executed
     if diagnostics is not None:
         entries.update(diagnostics._asdict())
-    return TensorDict(entries, batch_size=batch_size, device=device)
+    # Not TensorDict(...), whose checks of each entry are most of what this would take.
+    return TensorDict._new_unsafe(entries, batch_size=torch.Size(batch_size), device=device)
 
 
 def _vector_spec(env: EnvBase, kind: str, key: NestedKey) -> TensorSpec:
