@@ -2,7 +2,7 @@
 
     python torchrl_sac_training.py
 
-Two minutes on one core.
+Two to three minutes on one core.
 """
 
 import torch
