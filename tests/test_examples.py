@@ -128,7 +128,7 @@ def test_ppo_of_stable_baselines(small: list[Any], capsys) -> None:
 @pytest.mark.filterwarnings("ignore:the model is too poor")
 def test_a_regulator_on_dm_control(small: list[Any], capsys) -> None:
     pytest.importorskip("dm_control")
-    assert "| bias 0.1 |" in run("dm_control_lqr", capsys)
+    assert "| bias 0.4 |" in run("dm_control_lqr", capsys)
 
 
 def test_cells_of_a_script_become_a_page(tmp_path: Path) -> None:

@@ -10,5 +10,5 @@ def regulator(x):
 
 
 GAIN = np.array([[0.89, 9.22, 1.5, 2.52]])
-robust = torchrl_l1.robustify("dm_control/cartpole/balance", regulator, steps=5000)
-print(robust.evaluate({"bias": [0.2, 0.4]}, episodes=3, most_steps=500))
+robust = torchrl_l1.robustify("dm_control/cartpole/balance", regulator, steps=3000)
+print(robust.evaluate({"bias": 0.4}, episodes=3, most_steps=250))

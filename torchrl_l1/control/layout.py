@@ -251,8 +251,9 @@ def advance(
             f"{owner} found no state under {key!r}: {remedy}, and let no transform rename or "
             "remove it"
         )
-    entries = {name: nested.get(name, None) for name in names}
-    seal = nested.get(SEAL, None) if check else None
+    found = dict(nested.items())  # a look-up of each would cost as much as a small kernel
+    entries = {name: found.get(name) for name in names}
+    seal = found.get(SEAL) if check else None
     missing = [name for name, value in entries.items() if value is None]
     if check and seal_is_required and seal is None:
         missing.append(SEAL)

@@ -303,7 +303,8 @@ class L1Transform(Transform):
         return fresh
 
     def _seal(self, nested: TensorDictBase, observation: Tensor) -> None:
-        state = L1State(**{name: nested.get(name) for name in self._state_names})
+        found = dict(nested.items())
+        state = L1State(**{name: found[name] for name in self._state_names})
         seal = sealed(observation, state)
         nested.set(SEAL, seal)
         if not torch.compiler.is_compiling():
