@@ -173,7 +173,8 @@ def test_a_step_of_a_whole_environment_compiles_into_one_graph():
     parts = ["th", "thdot"], ["angle", "rate"]
     vector = CatTensors(["angle", "rate"], "observation", del_keys=False)
     ensemble = EnsembleDynamics(2, 1, members=2, hidden=(8,)).eval()
-    chain = Compose(UnsqueezeTransform(-1, *parts), vector, L1Transform(ensemble, epsilon=0.5))
+    apart = UnsqueezeTransform(-1, in_keys=parts[0], out_keys=parts[1])
+    chain = Compose(apart, vector, L1Transform(ensemble, epsilon=0.5))
     env = TransformedEnv(base, chain)
 
     def step(data: TensorDictBase) -> TensorDictBase:

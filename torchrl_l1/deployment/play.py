@@ -95,8 +95,7 @@ def film(
         seed_streams(seed, "play")
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             data = env.rollout(steps, robust.policy, callback=record)
-    if not shown:
-        record()  # of an episode of a single step
+    record()  # the last step, after which nothing is called
     ended = bool(data["next", "terminated"].any())
     frames = shown
     if source.task is not None:

@@ -145,7 +145,8 @@ class FunctionPolicy(TensorDictModuleBase):
     def _call(self, observation: Tensor) -> Tensor:
         if isinstance(self.function, nn.Module):
             observation = observation.to(_number_type(self.function) or observation.dtype)
-        found: Any = self.function(observation.numpy() if self.arrays else observation)
+        given: Any = observation.numpy() if self.arrays else observation
+        found: Any = self.function(given)
         found = found[0] if isinstance(found, tuple) else found
         return torch.as_tensor(np.asarray(found) if isinstance(found, list) else found)
 

@@ -347,9 +347,9 @@ def robustify(
         if data is None:
             with _bar("collect", "step", progress) as bar:
                 bar.total = steps
-                data = collect(source, acting, steps, environments, noise, seed, bar.update)
+                found = collect(source, acting, steps, environments, noise, seed, bar.update)
             _warn_of_disturbances(env)
-            found = data
+            data = found
         else:
             found = recorded(data, env)
         with _bar("fit", "epoch", progress) as bar:
