@@ -55,11 +55,11 @@ collector = Collector(
     env,
     actor,
     frames_per_batch=1600,
-    total_frames=24_000,
+    total_frames=16_000,
     auto_register_policy_transforms=False,
 )
 for number, data in enumerate(collector):
-    if number % 4 == 2:
+    if number % 3 == 0:
         ended = data["next", "done"].sum()
         print(f"{(number + 1) * 1600:6d} steps: {1600 / max(1, ended):4.0f} to a fall")
     for _ in range(10):
