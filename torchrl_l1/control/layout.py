@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -252,7 +252,7 @@ def advance(
             "remove it"
         )
     found = dict(nested.items())  # a look-up of each would cost as much as a small kernel
-    entries = {name: found.get(name) for name in names}
+    entries: dict[str, Any] = {name: found.get(name) for name in names}
     seal = found.get(SEAL) if check else None
     missing = [name for name, value in entries.items() if value is None]
     if check and seal_is_required and seal is None:
