@@ -16,6 +16,7 @@ from benchmarks import (
     jacobian,
     l1_controllers,
     l1_scaling,
+    l1_single,
     metrpo_iteration,
     planning,
     planning_precision,
@@ -32,6 +33,7 @@ RESULTS = Path(__file__).parent / "results"
 BENCHMARKS: dict[str, tuple[int, int, Callable[[int], Table]]] = {
     "jacobian": (jacobian.THREADS, 21, jacobian.table),
     "l1_scaling": (l1_scaling.THREADS, 9, l1_scaling.table),
+    "l1_single": (l1_single.THREADS, 15, l1_single.table),
     "l1_controllers": (l1_controllers.THREADS, 15, l1_controllers.table),
     "env_stepping": (env_stepping.THREADS, 9, env_stepping.table),
     "collection": (collection.THREADS, 7, collection.table),

@@ -1,4 +1,4 @@
-"""What README and guide show runs as it stands, and the lists in them are those of the code."""
+"""The lists and commands of README and guide are those of the code."""
 
 from __future__ import annotations
 
@@ -34,28 +34,6 @@ from torchrl_l1.experiment.settings import SCHEMAS, L1Settings, flatten
 from torchrl_l1.experiment.tracking import MODES
 
 ROOT = Path(__file__).parents[1]
-SNIPPETS = [
-    (page, snippet)
-    for page in ("README.md", "docs/quickstart.md")
-    for snippet in re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
-]
-
-
-@pytest.mark.parametrize(("page", "snippet"), SNIPPETS, ids=[page for page, _ in SNIPPETS])
-def test_snippet_runs(page: str, snippet: str) -> None:
-    names: dict[str, object] = {}
-    exec(compile(snippet, page, "exec"), names)
-    env = names.get("augmented", names.get("env"))
-    assert env.rollout(3)["next", "l1", "u_exec"].shape[-1] == 1
-
-
-@pytest.mark.parametrize("page", ["docs/tasks.md", "docs/disturbances.md"])
-def test_snippets_of_a_page_run_in_turn(page: str) -> None:
-    snippets = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
-    names: dict[str, object] = {}
-    for snippet in snippets:
-        exec(compile(snippet, page, "exec"), names)
-    assert snippets
 
 
 @pytest.fixture

@@ -92,7 +92,7 @@ def run_episodes(
     With one seed, episodes of one number start from the same reset whatever the disturbance and
     the control.
     """
-    extra = [*policy_transforms(policy), *control]
+    extra = [*policy_transforms(policy, source.one), *control]
     env = source.several(episodes, disturbances, extra)
     env.set_seed(stream_seed(seed, "evaluate") % 2**31)
     seed_streams(seed, "evaluate")

@@ -74,7 +74,7 @@ def film(
         ValueError: for an environment that cannot be drawn, or an unknown preset.
     """
     source = robust.source
-    control: list[Transform] = policy_transforms(robust.policy)
+    control: list[Transform] = policy_transforms(robust.policy, source.one)
     if l1 != OFF:
         control.append(L1Transform(robust.model, robust.settings(l1)))
     mujoco_ = source.task is not None or _physics(source.one()) is not None
@@ -95,8 +95,7 @@ def film(
         seed_streams(seed, "play")
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             data = env.rollout(steps, robust.policy, callback=record)
-    if not shown:
-        record()  # of an episode of a single step
+    record()  # the last step, after which nothing is called
     ended = bool(data["next", "terminated"].any())
     frames = shown
     if source.task is not None:
@@ -176,6 +175,12 @@ def check_film(file: Path | None) -> None:
         require("imageio_ffmpeg", "video")
 
 
+def _in_real_time(frames: Sequence[np.ndarray], dt: float) -> tuple[list[np.ndarray], float]:
+    """Frames of which no more than fifty come in a second, and the time of each, s."""
+    every = max(1, round(0.02 / dt))
+    return list(frames)[::every], dt * every
+
+
 def write_film(frames: Sequence[np.ndarray], file: str | Path, dt: float) -> Path:
     """Write frames in real time, as far as a player can follow.
 
@@ -190,9 +195,7 @@ def write_film(frames: Sequence[np.ndarray], file: str | Path, dt: float) -> Pat
     file = Path(file)
     check_film(file)
     file.parent.mkdir(parents=True, exist_ok=True)
-    # No more than fifty pictures a second.
-    every = max(1, round(0.02 / dt))
-    frames, seconds = list(frames)[::every], dt * every
+    frames, seconds = _in_real_time(frames, dt)
     if file.suffix == ".gif":
         images = [Image.fromarray(frame) for frame in frames]
         duration = max(20, round(1000 * seconds))
@@ -209,7 +212,12 @@ def write_film(frames: Sequence[np.ndarray], file: str | Path, dt: float) -> Pat
 
 
 def show_film(frames: Sequence[np.ndarray], dt: float, title: str) -> None:
-    """Show frames in a window until it is closed.
+    """Show frames in real time in a window until it is closed.
+
+    Args:
+        frames: RGB images.
+        dt: time of a step in seconds.
+        title: of the window.
 
     Raises:
         ValueError: if no window can be opened.
@@ -224,6 +232,7 @@ def show_film(frames: Sequence[np.ndarray], dt: float, title: str) -> None:
         raise ValueError(
             "no toolkit of windows is installed (such as python3-tk): give --output FILE.mp4"
         )
+    frames, seconds = _in_real_time(frames, dt)
     height, width = frames[0].shape[:2]
     figure = pyplot.figure(title, figsize=(width / 100, height / 100), dpi=100)
     axis = figure.add_axes((0, 0, 1, 1))
@@ -234,6 +243,6 @@ def show_film(frames: Sequence[np.ndarray], dt: float, title: str) -> None:
         image.set_data(frames[index])
         return [image]
 
-    animation = FuncAnimation(figure, draw, len(frames), interval=1000 * dt, blit=True)
+    animation = FuncAnimation(figure, draw, len(frames), interval=1000 * seconds, blit=True)
     pyplot.show()
     del animation

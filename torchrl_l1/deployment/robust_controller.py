@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase, TransformedEnv
 from tqdm import tqdm
 
@@ -29,6 +32,7 @@ from torchrl_l1.deployment.learning import (
     collect,
     epsilon_for,
     policy_transforms,
+    recorded,
     target_switch_rate,
 )
 from torchrl_l1.deployment.policies import Policy, load_policy
@@ -89,7 +93,10 @@ class RobustController:
         """
         config = self.settings(preset)
         env = TransformedEnv(vector_environment(env), auto_unwrap=True)
-        for transform in [*policy_transforms(self.policy), L1Transform(self.model, config)]:
+        for transform in [
+            *policy_transforms(self.policy, lambda: env),
+            L1Transform(self.model, config),
+        ]:
             env.append_transform(transform)
         return env
 
@@ -271,6 +278,7 @@ def robustify(
     dt: float | None = None,
     epsilon: float | None = None,
     switch_rate: float | None = None,
+    data: TensorDictBase | ReplayBuffer | Sequence[TensorDictBase] | None = None,
     normalization: str | None = None,
     weights: str | None = None,
     environments: int = 10,
@@ -296,6 +304,8 @@ def robustify(
         epsilon: tolerance of the paper's switching law, state units.
         switch_rate: switches per 1000 steps that epsilon is found from otherwise; if ``None``, in
             the middle of the paper's rule of thumb, see :func:`target_switch_rate`.
+        data: undisturbed transitions to learn from in place of steps that are collected, see
+            :func:`~torchrl_l1.dynamics.fit_dynamics`; the environment is then for the tests alone.
         normalization: statistics of VecNormalize, see :func:`load_policy`.
         weights: state dict of the policy, see :func:`load_policy`.
         environments: environments that are stepped at once.
@@ -335,9 +345,14 @@ def robustify(
     with _private_randomness():
         env = source.one()
         acting = load_policy(policy, env, normalization, weights)
-        with _bar("collect", "step", progress) as bar:
-            bar.total = steps
-            data = collect(source, acting, steps, environments, noise, seed, bar.update)
+        if data is None:
+            with _bar("collect", "step", progress) as bar:
+                bar.total = steps
+                found = collect(source, acting, steps, environments, noise, seed, bar.update)
+            _warn_of_disturbances(env)
+            data = found
+        else:
+            found = recorded(data, env)
         with _bar("fit", "epoch", progress) as bar:
             dynamics = fit_dynamics(
                 data, config=fit or FIT, seed=seed, on_epoch=lambda _: bar.update(),
@@ -348,7 +363,7 @@ def robustify(
     if epsilon is None:
         n = dynamics.observation_dim
         rate = target_switch_rate(n) if switch_rate is None else switch_rate
-        epsilon, _ = epsilon_for(dynamics, data, rate)
+        epsilon, _ = epsilon_for(dynamics, found, rate)
     origin = {
         "policy": policy if isinstance(policy, str) else None,
         "normalization": normalization,
@@ -362,7 +377,7 @@ def robustify(
     calibrate_filter(
         dynamics.residuals,
         dynamics.value_and_jacobian,
-        data.reshape(-1).select("observation", "action", ("next", "observation")).float(),
+        found.reshape(-1).select("observation", "action", ("next", "observation")).float(),
         configs["robust"],
     )
     order = [preset, *(name for name in PRESETS if name != preset)]
@@ -370,6 +385,20 @@ def robustify(
         source, acting, dynamics, {name: configs[name] for name in reversed(order)},
         preset, origin,
     )  # fmt: skip
+
+
+def _warn_of_disturbances(env: EnvBase) -> None:
+    """Data are to be of the undisturbed plant: a bias in them is nominal to the model."""
+    while isinstance(env, TransformedEnv):
+        for transform in env.transform.modules():
+            if callable(getattr(transform, "compensate", None)):
+                warnings.warn(
+                    f"the environment brings {type(transform).__name__} along: the model takes "
+                    "it for the plant's, and L1 will not cancel it; give robustify the undisturbed "
+                    "environment, and evaluate the disturbances",
+                    stacklevel=3,
+                )
+        env = env.base_env
 
 
 def load_target(
