@@ -31,6 +31,7 @@ PACKAGES = (
 UNEXPORTED = {
     "experiment": (
         *("RunSettings", "L1Settings", "WandbSettings", "METRPORecipe", "PETSRecipe", "MBMFRecipe"),
+        *("OfflineRecipe", "read_dataset", "write_dataset", "Episode", "record", "Recording"),
         *("SCHEMAS", "l1_config", "launch", "compose", "run", "RunDirectory", "RunDirectoryError"),
         *("RunDirectoryInUse", "versions", "Condition", "TrainedRun", "load_run", "conditions"),
         *("evaluate", "RecipeError", "available_recipes", "available_campaigns", "group_setting"),

@@ -118,6 +118,8 @@ def run(config: DictConfig) -> Path:
         algorithm.on_phase = lambda phase: progress.set_postfix_str(phase)
         directory = RunDirectory(recipe.run_dir)
         refuse_link(directory.path / "wandb")
+        if not (recipe.resume and directory.checkpoint_file.exists()):
+            algorithm.prepare()
         with directory.open(settings, recipe.resume):
             _run(algorithm, recipe, settings, directory, progress)
     print(f"Finished: {directory.metrics_file}")
