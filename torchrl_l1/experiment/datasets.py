@@ -105,10 +105,9 @@ def _saved(path: Path, columns: DatasetColumns) -> TensorDictBase:
         data = torch.load(path, weights_only=True, map_location="cpu")
     # Damage takes any form, and so does a file that is none of torch's.
     except Exception as error:
-        why = str(error).strip().partition("\n")[0][:200]
         raise ValueError(
-            f"{path} cannot be read as plain tensors ({why}); write it by "
-            "torch.save(data.to_dict(), file), or data.memmap(folder)"
+            f"{path} cannot be read as plain tensors; write it by "
+            "torch.save(data.clone().to_dict(), file), or data.memmap(folder)"
         ) from error
     return _tensordict(path, data, columns)
 
