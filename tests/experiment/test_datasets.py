@@ -137,8 +137,8 @@ def test_a_minari_dataset_is_read_by_its_folder_too(episodes: list[Episode]) -> 
 
 def test_tensors_in_one_file(episodes: list[Episode]) -> None:
     write_dataset("folder", episodes, get_task("inverted_pendulum"), "random")
-    data = read_dataset("folder")
-    torch.save(data.clone().to_dict(), "data.pt")
+    data = read_dataset("folder").clone()  # not the file itself
+    torch.save(data.to_dict(), "data.pt")
     flat = {".".join(key) if isinstance(key, tuple) else key: value.clone().contiguous()
             for key, value in data.items(True, True)}  # fmt: skip
     save_file(flat, "data.safetensors")

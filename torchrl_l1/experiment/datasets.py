@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -280,7 +281,7 @@ def write_dataset(output: str, episodes: Sequence[Episode], task: Task, algorith
     check_output(output)
     if path.suffix == ".npz":
         path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(path, **_rows(episodes))
+        np.savez_compressed(path, **_rows(episodes))  # type: ignore[arg-type]
     elif _MINARI_NAME.fullmatch(output):
         _write_minari(output, episodes, task, algorithm)
     else:
@@ -303,8 +304,9 @@ def check_output(output: str) -> None:
         raise ValueError(f"{output}: datasets are .npz files, folders, or Minari's (name-v0)")
     if _MINARI_NAME.fullmatch(output):
         try:
-            import h5py  # noqa: F401
             import minari
+
+            import_module("h5py")  # what Minari stores its data with
         except ModuleNotFoundError:
             raise ValueError(
                 f"{output} is the name of a Minari dataset, which needs Minari: pip install "
