@@ -51,6 +51,7 @@ def read(folder: Path) -> list[Row]:
                         "episode": int(row["episode"]),
                         "return": round(float(row["return"]), 5),
                         "data_reward": round(float(last["data/reward"]), 6),
+                        "clone": round(float(last.get("clone/return", "nan")), 5),
                     }
                 )
     return rows

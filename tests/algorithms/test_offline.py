@@ -135,6 +135,8 @@ def test_the_first_policy_acts_as_the_data_do() -> None:
         mean, _ = algorithm.policy(data["observation"])
         found[enabled] = float((mean.detach() - data["action"]).square().mean().sqrt())
         assert (metrics["clone/validation_loss"] > 0) == enabled
+        # Its own return: TRPO has changed next to nothing.
+        assert metrics["clone/return"] == pytest.approx(metrics["return_deterministic"], rel=1e-2)
     assert found[True] < 0.3 < 1 < found[False]
 
 

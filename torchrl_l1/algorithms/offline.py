@@ -54,6 +54,8 @@ OFFLINE_METRICS: dict[str, str] = {
     "data/reward": "Mean of the task's reward over the transitions.",
     "clone/validation_loss": "Mean squared difference between the cloned policy's mean action and "
     "the data's, in halves of the action range, on states kept out of training; 0 without cloning.",
+    "clone/return": "Mean return of `evaluation_episodes` real episodes with the mean action of "
+    "the first policy, cloned or random: what imagination has to add to.",
 }
 """What is known of the data and of the first policy; the same in all outer iterations."""
 
@@ -220,6 +222,12 @@ class Offline(Algorithm):
                 self.known |= self.fit()
                 self._calibrate_penalty()
                 self.known |= self._first_policy()
+                with self.phase("evaluate"):
+                    self.acting_policy.load_state_dict(self.policy.state_dict())
+                    first = episode_returns(self.evaluation.evaluate(self.seed, iteration))
+                    self.known["clone/return"] = first.mean().item()
+                # That has begun a stream of its own.
+                seed_streams(self.seed, "improvement")
 
             with self.phase("trpo"):
                 if config.policy.reset_std:
