@@ -32,6 +32,7 @@ UNEXPORTED = {
     "experiment": (
         *("RunSettings", "L1Settings", "WandbSettings", "CheckpointSettings", "METRPORecipe"),
         *("PETSRecipe", "MBMFRecipe", "final_return"),
+        *("OfflineRecipe", "read_dataset", "write_dataset", "Episode", "record", "Recording"),
         *("SCHEMAS", "l1_config", "launch", "compose", "run", "RunDirectory", "RunDirectoryError"),
         *("RunDirectoryInUse", "versions", "Condition", "TrainedRun", "load_run", "conditions"),
         *("evaluate", "RecipeError", "available_recipes", "available_campaigns", "group_setting"),

@@ -358,9 +358,10 @@ def digest(*settings: DictConfig) -> str:
 def without_newer(settings: DictConfig) -> DictConfig:
     """The settings but for those that are newer, which do what was done without them."""
     older = OmegaConf.create(OmegaConf.to_container(settings, resolve=True))
-    # Planners have had a precision of their own all along.
-    names = [n for n in NEWER if n != "precision" or settings.get("algorithm") == "metrpo"]
-    for name in names if "algorithm" in settings else []:
+    algorithm = settings.get("algorithm")
+    # Planners have had a precision of their own all along, and offline learning has had both.
+    had = {"metrpo": (), "offline": ("precision", "fit.precision")}.get(algorithm, ("precision",))
+    for name in [n for n in NEWER if n not in had] if algorithm is not None else []:
         assert OmegaConf.select(older, name) == NEWER[name]
         parent, _, key = name.rpartition(".")
         del (OmegaConf.select(older, parent) if parent else older)[key]

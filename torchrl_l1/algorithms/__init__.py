@@ -11,6 +11,12 @@ from torchrl_l1.algorithms.mbmf_config import (
 )
 from torchrl_l1.algorithms.metrpo import METRPO
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig, PolicyConfig
+from torchrl_l1.algorithms.offline import Offline
+from torchrl_l1.algorithms.offline_config import (
+    DatasetColumns,
+    OfflineCloningConfig,
+    OfflineConfig,
+)
 from torchrl_l1.algorithms.outcomes import OutcomeConfig, Outcomes
 from torchrl_l1.algorithms.pets import PETS
 from torchrl_l1.algorithms.pets_config import PETSConfig
@@ -23,10 +29,14 @@ __all__ = [
     "Algorithm",
     "ClonedPolicyConfig",
     "CloningConfig",
+    "DatasetColumns",
     "FineTuningConfig",
     "MBMFConfig",
     "METRPOConfig",
     "ModelConfig",
+    "Offline",
+    "OfflineCloningConfig",
+    "OfflineConfig",
     "OutcomeConfig",
     "Outcomes",
     "PETSConfig",

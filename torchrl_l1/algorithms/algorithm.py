@@ -102,10 +102,13 @@ class AlgorithmConfig(Protocol):
     """What the settings of all algorithms have in common."""
 
     outer_iterations: int
-    episode_steps: int | None
     label: str
     model: ModelConfig
     fit: FitConfig
+
+    @property
+    def episode_steps(self) -> int | None:
+        """Steps of a collected episode; a full one's if `None`."""
 
 
 class Surroundings(TypedDict, total=False):
@@ -228,6 +231,9 @@ class Algorithm(ABC):
     @abstractmethod
     def iterate(self) -> Iterator[IterationResult]:
         """Run the outer iterations that are left, reporting after each."""
+
+    def prepare(self) -> None:  # noqa: B027, most algorithms need nothing
+        """Read what is needed from elsewhere, and refuse what is of no use, before work starts."""
 
     @property
     @abstractmethod

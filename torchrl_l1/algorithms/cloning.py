@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_l1.algorithms.mbmf_config import CloningConfig
 from torchrl_l1.algorithms.model_learning import TrainingData
 from torchrl_l1.algorithms.policy import GaussianPolicy
 from torchrl_l1.dynamics.transitions import split_validation
@@ -25,6 +24,16 @@ CLONING_METRICS: dict[str, str] = {
     "clone/states": "Stage 2: labelled states so far.",
 }
 """What a round of cloning reports."""
+
+
+class CloningSettings(Protocol):
+    """How a policy is fitted, see :class:`~torchrl_l1.algorithms.CloningConfig`."""
+
+    learning_rate: float
+    batch_size: int
+    max_epochs: int
+    patience: int
+    validation_fraction: float
 
 
 @dataclass
@@ -66,7 +75,7 @@ class Cloning:
     """
 
     def __init__(
-        self, policy: GaussianPolicy, config: CloningConfig, half_range: float, capacity: int
+        self, policy: GaussianPolicy, config: CloningSettings, half_range: float, capacity: int
     ) -> None:
         self.policy, self.config, self.half_range = policy, config, half_range
         self.data = TrainingData(capacity, config.batch_size, config.validation_fraction)

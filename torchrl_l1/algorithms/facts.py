@@ -82,6 +82,7 @@ class AlgorithmFacts:
             evaluations ``sim_to_real`` and ``ablation``.
         compares_models: whether the paper compares forms of the model with it (Figure 2).
         reference_logs: whether the authors have released logs of it.
+        offline: whether real steps stay the same from one outer iteration to the next.
         variants: its forms that count as algorithms of their own, by the name of each.
     """
 
@@ -93,6 +94,7 @@ class AlgorithmFacts:
     tables: Mapping[str, str] = field(default_factory=dict)
     compares_models: bool = False
     reference_logs: bool = False
+    offline: bool = False
     variants: Mapping[str, Variant] = field(default_factory=dict)
 
     @property

@@ -87,6 +87,12 @@ class ModelLearning:
         self._kept += [("next", "observation"), ("next", "reward")]
         self._kept += [("next", "terminated")] * terminations
 
+    def reserve(self, capacity: int) -> None:
+        """Forget all transitions, and make room for so many."""
+        config = self.config
+        self.data = TrainingData(capacity, config.batch_size, config.validation_fraction)
+        self.buffer = self.data.buffer
+
     def store(self, data: TensorDictBase) -> None:
         """Add real transitions ``[N, T]``, a fixed share of them marked for validation."""
         flat = data.reshape(-1)

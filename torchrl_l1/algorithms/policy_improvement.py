@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import fmean
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -13,13 +14,13 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from torchrl_l1.algorithms.metrpo_config import METRPOConfig
 from torchrl_l1.algorithms.outcomes import Outcomes
 from torchrl_l1.algorithms.policy import GaussianPolicy, make_actor
 from torchrl_l1.dynamics import EnsembleDynamics, imagine
 from torchrl_l1.envs import StartStates, Task
 from torchrl_l1.objectives import (
     LinearFeatureBaseline,
+    TRPOConfig,
     TRPOReport,
     gaussian_trpo_step,
     trpo_step,
@@ -35,6 +36,21 @@ POLICY_METRICS: dict[str, str] = {
     "trpo/accepted": "Share of TRPO steps whose line search succeeded.",
 }
 """What the policy's improvement reports: all TRPO steps of an outer iteration."""
+
+
+class ImprovementConfig(Protocol):
+    """Settings of the improvement, see :class:`~torchrl_l1.algorithms.METRPOConfig`."""
+
+    imagined_steps: int
+    imagined_horizon: int
+    imagined_from_data: float
+    imagined_termination: bool
+    box_exit: str
+    bootstrap: bool
+    discount: float
+    gae_lambda: float
+    trpo: TRPOConfig
+    precision: str
 
 
 @dataclass
@@ -55,6 +71,7 @@ class PolicyImprovement:
         policy: changed in place, on the model's device.
         config: settings.
         outcomes: rewards and ends of what is imagined.
+        penalize: changes the imagined trajectories before anything is learned from them.
     """
 
     def __init__(
@@ -62,9 +79,11 @@ class PolicyImprovement:
         task: Task,
         dynamics: EnsembleDynamics,
         policy: GaussianPolicy,
-        config: METRPOConfig,
+        config: ImprovementConfig,
         outcomes: Outcomes,
+        penalize: Callable[[TensorDict], TensorDict] | None = None,
     ) -> None:
+        self.penalize = penalize
         self.task, self.dynamics, self.policy, self.config = task, dynamics, policy, config
         self.outcomes = outcomes
         self.device = next(policy.parameters()).device
@@ -89,6 +108,8 @@ class PolicyImprovement:
             self.outcomes.terminated(self.task.terminated if config.imagined_termination else None),
             precision=config.precision,  # type: ignore[arg-type]
         )
+        if self.penalize is not None:
+            trajectories = self.penalize(trajectories)
         observation, step = trajectories["observation"], trajectories["step"]
         if config.bootstrap:
             step = torch.zeros_like(step)

@@ -66,7 +66,7 @@ class PlannedRun:
     def collected_steps(self, iterations: int) -> int:
         """Real steps that so many outer iterations collect; random data do not count."""
         full = self.config.horizon or get_task(self.config.task).horizon
-        steps = episode_length(self.config.episode_steps, full)
+        steps = episode_length(self.config.get("episode_steps"), full)
         return self._recipe.collected_episodes(iterations) * steps
 
     def stages(self) -> tuple[str, ...]:

@@ -33,6 +33,12 @@ _DEPLOYMENT = (
         "Writes a robust controller as TorchScript, ONNX or an exported program of torch, and "
         "compares it with the original on steps of the environment.",
     ),
+    (
+        "dataset",
+        "record data of a run's policy, for offline learning",
+        "Records undisturbed episodes without L1 at one of three qualities: random actions, the "
+        "policy with noise, or the policy.",
+    ),
 )
 
 

@@ -58,6 +58,8 @@ def run(config: DictConfig) -> Path:
         directory = RunDirectory(recipe.run_dir)
         for folder in ("wandb", "tensorboard", "checkpoints"):
             refuse_link(directory.path / folder)
+        if not (recipe.resume and directory.checkpoint_file.exists()):
+            algorithm.prepare()
         with directory.open(settings, recipe.resume):
             _run(algorithm, recipe, settings, directory, progress)
     print(f"Finished: {directory.metrics_file}")

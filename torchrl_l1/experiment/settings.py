@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, partial
 from typing import Any, ClassVar
 
 from hydra.core.config_store import ConfigStore
@@ -19,6 +19,8 @@ from torchrl_l1.algorithms import (
     Algorithm,
     MBMFConfig,
     METRPOConfig,
+    Offline,
+    OfflineConfig,
     OutcomeConfig,
     Perturbation,
     PETSConfig,
@@ -30,6 +32,7 @@ from torchrl_l1.checks import check_choice, check_count, check_optional_count
 from torchrl_l1.compilation import check_mode
 from torchrl_l1.control import L1Config
 from torchrl_l1.envs import get_task
+from torchrl_l1.experiment.datasets import read_dataset
 from torchrl_l1.experiment.files import bounded_overrides
 
 
@@ -355,10 +358,29 @@ class MBMFRecipe(MBMFConfig, RunSettings):
         self.check()
 
 
+@dataclass
+class OfflineRecipe(OfflineConfig, RunSettings):
+    """A recipe of offline learning: run settings and the algorithm's own, side by side."""
+
+    algorithm: str = "offline"
+    builds: ClassVar[type[Algorithm]] = Offline
+
+    def __post_init__(self) -> None:
+        self.check()
+
+    def build(self) -> Algorithm:
+        """The algorithm, which reads the dataset when it begins: to evaluate it none is needed."""
+        algorithm = super().build()
+        assert isinstance(algorithm, Offline)
+        algorithm.data = partial(read_dataset, self.dataset, self.columns)
+        return algorithm
+
+
 SCHEMAS: dict[str, type[RunSettings]] = {
     "metrpo": METRPORecipe,
     "pets": PETSRecipe,
     "mbmf": MBMFRecipe,
+    "offline": OfflineRecipe,
 }
 """Schema of the recipes of each algorithm. In a recipe's defaults it is ``<name>_recipe``."""
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from torchrl_l1.report.identity import BASELINE
+from torchrl_l1.report.identity import BASELINE, facts
 from torchrl_l1.report.page import Page
 from torchrl_l1.report.published import Curves, ReferenceCurves
 from torchrl_l1.report.runs import Run
@@ -204,6 +204,17 @@ class Panel:
         lines = [line for line in self.lines if any(len(run.returns) for run in line.runs)]
         return replace(self, lines=lines)
 
+    @property
+    def offline(self) -> bool:
+        """Whether all algorithms in it learn from data that stay the same."""
+        return all(
+            facts(run.identity.algorithm).offline for line in self.lines for run in line.runs
+        )
+
+    def along(self, run: Run) -> np.ndarray:
+        """What a run is drawn over `(T,)`: thousands of real steps, or outer iterations."""
+        return np.arange(len(run.returns)) + 1.0 if self.offline else run.real_steps / 1000
+
     def part(self, run: Run) -> np.ndarray:
         """Which outer iterations ``(T,)`` of a run are drawn."""
         every = np.full(len(run.returns), True)
@@ -243,17 +254,17 @@ def _draw(axis: Axes, panel: Panel) -> list[np.ndarray]:
     """Draw a panel; returns the values that are in sight."""
     shown = []
     ends = [
-        max(run.real_steps[-1] for run in line.runs if len(run.returns)) for line in panel.lines
+        max(panel.along(run)[-1] for run in line.runs if len(run.returns)) for line in panel.lines
     ]
     end = max(ends)
     for grey in panel.authors:
-        steps, values = grey.curves.real_steps.mean(axis=0), grey.curves.returns.mean(axis=0)
+        steps, values = grey.curves.real_steps.mean(axis=0) / 1000, grey.curves.returns.mean(axis=0)
         _line(axis, steps, values, grey.style, "0.55", 1.8, label=grey.label)
         shown.append(values[steps <= end])
     for line in panel.lines:
         for run in line.runs:
             style, part = line.style if run.finished else ":", panel.part(run)
-            steps, values = run.real_steps[part], run.returns[part]
+            steps, values = panel.along(run)[part], run.returns[part]
             _line(axis, steps, values, style, line.color, 0.8, alpha=0.5, marker=_dots(steps))
             shown.append(values)
             if not run.finished:
@@ -261,7 +272,7 @@ def _draw(axis: Axes, panel: Panel) -> list[np.ndarray]:
         done = [run for run in line.runs if run.finished]
         if done:
             steps, means = np.mean(
-                [[values[panel.part(r)] for values in (r.real_steps, r.returns)] for r in done],
+                [[values[panel.part(r)] for values in (panel.along(r), r.returns)] for r in done],
                 axis=0,
             )
             dots = _dots(steps)
@@ -270,7 +281,7 @@ def _draw(axis: Axes, panel: Panel) -> list[np.ndarray]:
                 [
                     [
                         values[line.own(r) & panel.part(r)]
-                        for values in (r.real_steps, r.deterministic)
+                        for values in (panel.along(r), r.deterministic)
                     ]
                     for r in done
                 ],
@@ -289,10 +300,10 @@ def _draw(axis: Axes, panel: Panel) -> list[np.ndarray]:
     elif end > _MOST_TIMES * min(ends):
         axis.set_xscale("log")
         axis.xaxis.set_major_formatter("{x:g}")
-        axis.set_xlim(right=end / 1000 * 1.05)
+        axis.set_xlim(right=end * 1.05)
     else:
-        axis.set_xlim(0, end / 1000 * 1.02)
-    axis.set_xlabel("real environment steps (thousands)")
+        axis.set_xlim(0, end * 1.02)
+    axis.set_xlabel("outer iterations" if panel.offline else "real environment steps (thousands)")
     axis.set_ylabel("return (sum of rewards)")
     axis.grid(alpha=0.3)
     return shown
@@ -312,4 +323,4 @@ def _line(
     width: float,
     **options: Any,
 ) -> None:
-    axis.plot(steps / 1000, values, linestyle=style, color=shade, linewidth=width, **options)
+    axis.plot(steps, values, linestyle=style, color=shade, linewidth=width, **options)

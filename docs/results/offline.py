@@ -1,0 +1,239 @@
+"""Offline learning from data of three qualities, deployed under actuator biases: table and figure.
+
+    torchrl-l1 dataset RUN_DIR datasets/TASK/QUALITY.npz --quality QUALITY    # for each
+    torchrl-l1 campaign offline --output runs/offline
+    python docs/results/offline.py runs/offline
+
+Writes `summary.csv`, `returns.md`, `recovered.md` and `returns.png` to the folder
+`offline` beside this file.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from torchrl_l1.experiment.files import write_table
+from torchrl_l1.experiment.run_directory import read_config
+from torchrl_l1.report.page import markdown
+
+HERE = Path(__file__).parent / "offline"
+TASKS = ("inverted_pendulum", "half_cheetah", "hopper")
+QUALITIES = ("random", "medium", "expert")
+CONTROLLERS = {"off": "#999999", "paper": "#d55e00", "robust": "#0072b2", "oracle": "#000000"}
+RESAMPLES = 2000
+Row = dict[str, Any]
+
+
+def read(folder: Path) -> list[Row]:
+    """Rows of single episodes of all evaluated runs."""
+    rows = []
+    for file in sorted(folder.rglob("evaluations/episodes/disturbances.csv")):
+        run = file.parents[2]
+        config = read_config(run / "config.yaml")
+        with (run / "metrics.csv").open() as handle:
+            last = list(csv.DictReader(handle))[-1]
+        with file.open() as handle:
+            for row in csv.DictReader(handle):
+                rows.append(
+                    {
+                        "task": config["task"],
+                        "quality": Path(config["dataset"]).stem,
+                        "seed": config["seed"],
+                        "l1": row["l1"],
+                        "bias": float(row["bias"]),
+                        "episode": int(row["episode"]),
+                        "return": round(float(row["return"]), 5),
+                        "data_reward": round(float(last["data/reward"]), 6),
+                        "clone": round(float(last.get("clone/return", "nan")), 5),
+                    }
+                )
+    return rows
+
+
+def select(rows: Sequence[Row], **where: Any) -> list[Row]:
+    """Rows with these values."""
+    return [row for row in rows if all(row[key] == value for key, value in where.items())]
+
+
+def table(rows: Sequence[Row], l1: str, biases: Sequence[float]) -> np.ndarray:
+    """Returns ``(seeds, biases, episodes)`` of a controller."""
+    seeds = sorted({row["seed"] for row in rows})
+    return np.array(
+        [
+            [
+                [row["return"] for row in select(rows, l1=l1, bias=bias, seed=seed)]
+                for bias in biases
+            ]
+            for seed in seeds
+        ]
+    )
+
+
+def resampled(shape: tuple[int, ...], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of seeds, and of episodes in each, drawn with replacement."""
+    seeds = rng.integers(shape[0], size=(RESAMPLES, shape[0]))
+    episodes = rng.integers(shape[2], size=(RESAMPLES, shape[0], shape[2]))
+    return seeds, episodes
+
+
+def means(values: np.ndarray, seeds: np.ndarray, episodes: np.ndarray) -> np.ndarray:
+    """Mean over all of each resample ``(RESAMPLES,)``; equal draws for all controllers."""
+    drawn = values[seeds[:, :, None, None], np.arange(values.shape[1])[:, None],
+                   episodes[:, :, None, :]]  # fmt: skip
+    return drawn.mean((1, 2, 3))
+
+
+def summarize(rows: Sequence[Row]) -> list[Row]:
+    """A row for each task, quality, bias (all but 0 together too) and controller."""
+    found = []
+    for task in TASKS:
+        for quality in QUALITIES:
+            cell = select(rows, task=task, quality=quality)
+            if not cell:
+                continue
+            every = sorted({row["bias"] for row in cell})
+            groups: dict[str, list[float]] = {f"{bias:g}": [bias] for bias in every}
+            groups["biased"] = [bias for bias in every if bias]
+            for name, biases in groups.items():
+                tables = {l1: table(cell, l1, biases) for l1 in CONTROLLERS}
+                draws = resampled(tables["off"].shape, np.random.default_rng(0))
+                samples = {l1: means(values, *draws) for l1, values in tables.items()}
+                for l1, values in tables.items():
+                    low, high = np.percentile(samples[l1], (2.5, 97.5))
+                    change = samples[l1] - samples["off"]
+                    found.append(
+                        {
+                            "task": task,
+                            "quality": quality,
+                            "bias": name,
+                            "l1": l1,
+                            "seeds": values.shape[0],
+                            "episodes_per_seed": values.shape[2],
+                            "return_mean": float(values.mean()),
+                            "return_low": float(low),
+                            "return_high": float(high),
+                            "change": float(values.mean() - tables["off"].mean()),
+                            "change_low": float(np.percentile(change, 2.5)),
+                            "change_high": float(np.percentile(change, 97.5)),
+                        }
+                    )
+    return found
+
+
+def number(value: float) -> str:
+    """Three digits, no exponent."""
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def interval(row: Row, name: str) -> str:
+    """A mean with its interval."""
+    low, high = number(row[f"{name}_low"]), number(row[f"{name}_high"])
+    return f"{number(row['return_mean' if name == 'return' else name])} [{low}, {high}]"
+
+
+def returns_page(summary: Sequence[Row], rows: Sequence[Row], horizon: dict[str, int]) -> str:
+    """Means by controller, without bias and with."""
+    lines = []
+    for task in TASKS:
+        for quality in QUALITIES:
+            cell = select(summary, task=task, quality=quality)
+            if not cell:
+                continue
+            data = select(rows, task=task, quality=quality)[0]["data_reward"] * horizon[task]
+            for bias in ("0", "biased"):
+                of_bias = {row["l1"]: row for row in select(cell, bias=bias)}
+                line = {
+                    "task": task,
+                    "data": quality,
+                    "return of the data": number(data),
+                    "bias": "none" if bias == "0" else "all others",
+                }
+                lines.append(line | {l1: interval(of_bias[l1], "return") for l1 in CONTROLLERS})
+    return markdown(lines)
+
+
+def recovered_page(summary: Sequence[Row]) -> str:
+    """What each controller changes, without bias and with, against none."""
+    lines = []
+    for row in summary:
+        if row["l1"] == "off" or row["bias"] not in ("0", "biased"):
+            continue
+        where = {key: row[key] for key in ("task", "quality", "bias")}
+        place = {
+            "task": row["task"],
+            "data": row["quality"],
+            "bias": "none" if row["bias"] == "0" else "all others",
+        }
+        if row["l1"] == "paper":
+            lines.append(place)
+        lines[-1][row["l1"]] = interval(row, "change")
+        if row["l1"] == "oracle":
+            robust = select(summary, l1="robust", **where)[0]["change"]
+            paper = select(summary, l1="paper", **where)[0]["change"]
+            clear = row["change_low"] > 0 and row["bias"] == "biased"
+            for name, value in (("paper", paper), ("robust", robust)):
+                lines[-1][f"{name} recovers"] = f"{value / row['change']:.2f}" if clear else ""
+    return markdown(lines)
+
+
+def draw(summary: Sequence[Row]) -> None:
+    """Returns against the bias, a panel for each task and quality."""
+    tasks = [task for task in TASKS if select(summary, task=task)]
+    figure, axes = plt.subplots(
+        len(tasks), len(QUALITIES), figsize=(9.5, 2.7 * len(tasks)), squeeze=False
+    )
+    for line, task in zip(axes, tasks, strict=True):
+        for axis, quality in zip(line, QUALITIES, strict=True):
+            for l1, color in CONTROLLERS.items():
+                cell = [
+                    row
+                    for row in select(summary, task=task, quality=quality, l1=l1)
+                    if row["bias"] != "biased"
+                ]
+                biases = [float(row["bias"]) for row in cell]
+                low, mean, high = (
+                    [row[f"return_{name}"] for row in cell] for name in ("low", "mean", "high")
+                )
+                style = "--" if l1 == "oracle" else "-"
+                axis.plot(biases, mean, style, marker="o", ms=3, color=color, label=l1)
+                axis.fill_between(biases, low, high, color=color, alpha=0.12, linewidth=0)
+            axis.set_title(f"{task}, {quality} data", fontsize=9)
+            axis.spines[["top", "right"]].set_visible(False)
+            axis.grid(alpha=0.3)
+        line[0].set_ylabel("return")
+    for axis in axes[-1]:
+        axis.set_xlabel("actuator bias")
+    axes[0][0].legend(fontsize=8)
+    figure.tight_layout()
+    figure.savefig(HERE / "returns.png", dpi=110)
+
+
+def main(folder: Path) -> None:
+    """All of it."""
+    from torchrl_l1.envs import get_task
+
+    rows = read(folder)
+    if not rows:
+        sys.exit(f"no evaluated runs below {folder}")
+    HERE.mkdir(exist_ok=True)
+    summary = summarize(rows)
+    shown = [{k: f"{v:.5g}" if isinstance(v, float) else v for k, v in r.items()} for r in summary]
+    write_table(HERE / "summary.csv", shown)
+    horizon = {task: get_task(task).horizon for task in TASKS}
+    (HERE / "returns.md").write_text(returns_page(summary, rows, horizon) + "\n")
+    (HERE / "recovered.md").write_text(recovered_page(summary) + "\n")
+    draw(summary)
+    print((HERE / "returns.md").read_text(), (HERE / "recovered.md").read_text(), sep="\n")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
+    main(Path(sys.argv[1]))

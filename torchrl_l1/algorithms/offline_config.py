@@ -1,0 +1,187 @@
+"""Settings of offline learning: data, penalty, and the policy's improvement in imagination."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from torchrl_l1.algorithms.config import ModelConfig
+from torchrl_l1.algorithms.metrpo_config import PolicyConfig
+from torchrl_l1.checks import (
+    check_choice,
+    check_counts,
+    check_not_negative,
+    check_positive,
+    check_within,
+)
+from torchrl_l1.dynamics import FitConfig
+from torchrl_l1.objectives import TRPOConfig
+from torchrl_l1.planning import resolve_precision
+
+PENALTIES = ("mopo", "morel", "none")
+"""What is done about a model that does not know, see :class:`OfflineConfig`."""
+
+MEASURES = ("auto", "deviation", "disagreement")
+"""How it is measured what a model does not know, see :class:`OfflineConfig`."""
+
+
+@dataclass
+class DatasetColumns:
+    """Names of what a dataset holds; empty lists and null for the usual ones.
+
+    Attributes:
+        observation: columns of a CSV file, arrays of an NPZ file, or the key of tensordicts and
+            Minari's dictionaries; ``observation`` if empty.
+        action: likewise; ``action`` if empty.
+        episode: column or array that numbers the episodes of a CSV or NPZ file; that of NPZ files
+            is ``episode``, if there is one.
+        time: column or array of the time there, s.
+    """
+
+    observation: list[str] = field(default_factory=list)
+    action: list[str] = field(default_factory=list)
+    episode: str | None = None
+    time: str | None = None
+
+
+@dataclass
+class OfflineCloningConfig:
+    """The fit of the first policy to the actions in the data.
+
+    Attributes:
+        enabled: whether there is one; otherwise the first policy is random.
+        learning_rate: Adam's step size.
+        batch_size: states per gradient step.
+        max_epochs: passes over the data.
+        patience: epochs without a lower validation loss before it stops.
+        validation_fraction: share of the states kept out of training.
+    """
+
+    enabled: bool = True
+    learning_rate: float = 1e-3
+    batch_size: int = 500
+    max_epochs: int = 30
+    patience: int = 5
+    validation_fraction: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_counts(self, "batch_size", "max_epochs", "patience", prefix="cloning.")
+        check_positive("cloning.learning_rate", self.learning_rate)
+        check_within("cloning.validation_fraction", self.validation_fraction, "(0, 1)")
+
+
+@dataclass
+class OfflineConfig:
+    """Settings of :class:`~torchrl_l1.algorithms.Offline`.
+
+    Attributes:
+        outer_iterations: rounds of policy improvement, each followed by a measurement.
+        dataset: where the data are: a Minari dataset's name or folder, a run directory, a folder
+            of a memory-mapped tensordict, or a file: ``.pt``, ``.safetensors``, ``.npz``, ``.csv``.
+        columns: see :class:`DatasetColumns`.
+        label: action of a run directory's data that counts: ``nominal`` is the policy's,
+            ``executed`` what L1 sent to the actuators. Others have one action.
+        penalty: ``mopo`` takes ``penalty_coefficient`` times the uncertainty off the reward
+            (arXiv 2005.13239); ``morel`` ends an imagined trajectory where the uncertainty is
+            above a threshold, in a state that is worth ``penalty_coefficient`` less per step than
+            the worst in the data (arXiv 2005.05951); ``none`` trusts the model.
+        penalty_coefficient: see ``penalty``, reward units.
+        uncertainty: ``deviation``, the largest norm of the standard deviations that a member with
+            a Gaussian head predicts; ``disagreement``, the largest distance between the means of
+            two members; ``auto``, the former where there are such heads. In units of the standard
+            deviation that an entry's change of one step has in the data.
+        halt_deviations: the threshold is this many standard deviations above the mean of the
+            uncertainty of the data.
+        evaluation_episodes: real episodes after each round, with the mean action and as many with
+            sampled ones. Nothing is learned from them.
+        trpo_iterations: TRPO steps per round.
+        imagined_steps: imagined transitions per TRPO step.
+        imagined_horizon: length of an imagined trajectory.
+        imagined_from_data: share of the imagined trajectories that start in the data; the others
+            start as the task does.
+        imagined_termination: whether imagined trajectories end where the task's episodes do.
+        box_exit: what an imagined trajectory that leaves the box around the data is worth, see
+            :class:`~torchrl_l1.algorithms.METRPOConfig`. With ``morel`` it is halted there.
+        bootstrap: whether an imagined trajectory goes on in the baseline's estimate, likewise.
+        discount: gamma.
+        gae_lambda: lambda of the generalized advantage estimate.
+        model: see :class:`ModelConfig`.
+        policy: see :class:`PolicyConfig`.
+        fit: see :class:`~torchrl_l1.dynamics.FitConfig`. There is one fit only.
+        cloning: see :class:`OfflineCloningConfig`.
+        trpo: see :class:`~torchrl_l1.objectives.TRPOConfig`.
+        precision: of the hidden layers in imagination: ``float32``, ``bfloat16``, or ``auto``.
+    """
+
+    outer_iterations: int = 10
+    dataset: str = ""
+    columns: DatasetColumns = field(default_factory=DatasetColumns)
+    label: str = "executed"
+    penalty: str = "mopo"
+    penalty_coefficient: float = 1.0
+    uncertainty: str = "auto"
+    halt_deviations: float = 5.0
+    evaluation_episodes: int = 6
+    trpo_iterations: int = 20
+    imagined_steps: int = 20_000
+    imagined_horizon: int = 50
+    imagined_from_data: float = 1.0
+    imagined_termination: bool = True
+    box_exit: str = "truncate"
+    bootstrap: bool = True
+    discount: float = 0.99
+    gae_lambda: float = 0.95
+    model: ModelConfig = field(default_factory=ModelConfig)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    cloning: OfflineCloningConfig = field(default_factory=OfflineCloningConfig)
+    trpo: TRPOConfig = field(default_factory=TRPOConfig)
+    precision: str = "float32"
+
+    def __post_init__(self) -> None:
+        resolve_precision(self.precision)
+        check_choice("label", self.label, ("nominal", "executed"))
+        check_choice("penalty", self.penalty, PENALTIES)
+        check_choice("uncertainty", self.uncertainty, MEASURES)
+        check_choice("box_exit", self.box_exit, ("truncate", "fail"))
+        check_not_negative("penalty_coefficient", self.penalty_coefficient)
+        check_not_negative("halt_deviations", self.halt_deviations)
+        counts = ("outer_iterations", "evaluation_episodes", "trpo_iterations", "imagined_horizon")
+        check_counts(self, *counts)
+        if not self.imagined_steps >= self.imagined_horizon:
+            raise ValueError(
+                f"imagined_steps ({self.imagined_steps}) must hold at least one trajectory of "
+                f"imagined_horizon ({self.imagined_horizon}) steps"
+            )
+        for name in ("imagined_from_data", "discount", "gae_lambda"):
+            check_within(name, getattr(self, name), "[0, 1]")
+        if self.uncertainty == "deviation" and self.model.head != "gaussian":
+            raise ValueError(
+                "uncertainty=deviation needs members that predict a distribution: set "
+                "model.head=gaussian, or uncertainty=disagreement"
+            )
+        if self.penalty != "none" and self.measure == "disagreement" and self.model.members < 2:
+            raise ValueError(
+                f"penalty={self.penalty} by disagreement needs two members or more, "
+                f"model.members is {self.model.members}"
+            )
+        if self.penalty == "morel" and self.bootstrap and self.discount == 1:
+            raise ValueError(
+                "penalty=morel with bootstrap=true needs a discount below 1: a trajectory that is "
+                "halted would be worth minus infinity"
+            )
+
+    @property
+    def episode_steps(self) -> None:
+        """Measured episodes are full ones."""
+        return None
+
+    @property
+    def measure(self) -> str:
+        """What ``uncertainty`` becomes: ``deviation`` or ``disagreement``."""
+        if self.uncertainty != "auto":
+            return self.uncertainty
+        return "deviation" if self.model.head == "gaussian" else "disagreement"
+
+    def collected_episodes(self, iterations: int) -> int:
+        """Real episodes of so many outer iterations: those that are measured."""
+        return iterations * self.evaluation_episodes

@@ -1,0 +1,44 @@
+"""``torchrl-l1 dataset``: data of a run's policy, for offline learning."""
+
+from __future__ import annotations
+
+import argparse
+
+from torchrl_l1.experiment.datasets import check_output, write_dataset
+from torchrl_l1.experiment.evaluate import load_run
+from torchrl_l1.experiment.recording import QUALITIES, record
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``torchrl-l1 dataset``."""
+    add = parser.add_argument
+    add("run_dir", help="the run directory whose policy is used")
+    add(
+        "output",
+        help="a .npz file, a folder, or a name such as hopper/medium-v0 for a Minari dataset",
+    )
+    add(
+        "--quality",
+        choices=QUALITIES,
+        default="expert",
+        help="random actions; the policy with so much noise that its return is a third to a half; "
+        "or the policy",
+    )
+    add("--steps", type=int, default=20_000, help="how many at least, in whole episodes")
+    add("--seed", type=int, default=0, help="of resets, actions and noise")
+
+
+def dataset_command(options: argparse.Namespace) -> None:
+    """``torchrl-l1 dataset``: the dataset, and a line on how good it is."""
+    check_output(options.output)
+    trained = load_run(options.run_dir)
+    found = record(trained, options.quality, options.steps, options.seed, print)
+    task = trained.algorithm.task
+    algorithm = f"{trained.recipe.algorithm} {options.quality}"
+    name = write_dataset(options.output, found.episodes, task, algorithm)
+    print(
+        f"{task.name}, {options.quality}: {found.transitions} transitions in "
+        f"{len(found.episodes)} episodes, mean return {found.returns[1]:.4g}"
+        + (f", {found.share:.2f} of the way from random to expert" * (found.share == found.share))
+    )
+    print(f"Dataset: {name}\nTo learn from it: torchrl-l1 run offline/... dataset={name}")

@@ -1,0 +1,395 @@
+"""Datasets that an offline recipe names: read from where they are, and written."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from torchrl_l1.algorithms import DatasetColumns
+from torchrl_l1.dynamics import read_csv, read_minari, read_npz
+from torchrl_l1.envs import Task
+from torchrl_l1.experiment.checkpoints import read_checkpoint
+from torchrl_l1.experiment.errors import RunDirectoryError
+from torchrl_l1.registration import EPISODE_STEPS, gymnasium_id
+
+_MINARI_NAME = re.compile(r"[-\w/]+-v\d+")
+_CHECKPOINTS = ("checkpoint.pt", "checkpoint_previous.pt")
+_PICKLES = ("*.pkl", "*.pickle")
+
+
+def read_dataset(source: str, columns: DatasetColumns | None = None) -> TensorDictBase:
+    """Transitions from wherever they are.
+
+    Args:
+        source: a ``.npz``, ``.csv``, ``.pt`` or ``.safetensors`` file; the folder of a run, of a
+            memory-mapped tensordict or of a Minari dataset; or the name of a Minari dataset that is
+            on this machine, such as ``hopper/medium-v0``. Of a run the real transitions of its
+            checkpoint count.
+        columns: what the observation, the action and so on are called there.
+
+    Returns:
+        ``observation``, ``action`` and ``("next", "observation")`` at least, any batch size.
+
+    Raises:
+        FileNotFoundError: if there is no such dataset.
+        KeyError: if it lacks what it should hold.
+        ValueError: if it cannot be read, or is of a kind that is not known.
+    """
+    columns = columns or DatasetColumns()
+    path = Path(source)
+    try:
+        if not source:
+            raise ValueError("offline learning needs a dataset: set dataset=...")
+        if path.is_dir():
+            data = _folder(path)
+        elif path.is_file():
+            data = _file(path, columns)
+        elif _MINARI_NAME.fullmatch(source):
+            data = read_minari(source)
+        else:
+            raise FileNotFoundError(
+                f"{source}: no such dataset; torchrl-l1 dataset RUN_DIR {source} makes one"
+            )
+    except (ModuleNotFoundError, TypeError) as error:
+        raise ValueError(str(error)) from error
+    return _named(source, data, columns)
+
+
+def _file(path: Path, columns: DatasetColumns) -> TensorDictBase:
+    kinds: dict[str, Callable[[Path, DatasetColumns], TensorDictBase]] = {
+        ".csv": _csv,
+        ".npz": _npz,
+        ".pt": _saved,
+        ".safetensors": _safetensors,
+    }
+    if path.suffix not in kinds:
+        raise ValueError(f"{path} is no dataset: there are {', '.join(kinds)} files and folders")
+    return kinds[path.suffix](path, columns)
+
+
+def _csv(path: Path, columns: DatasetColumns) -> TensorDict:
+    if not (columns.observation and columns.action):
+        raise ValueError(
+            f"{path}: say which columns are what, columns.observation=[x,v] columns.action=[u]"
+        )
+    return read_csv(path, **vars(columns))
+
+
+def _npz(path: Path, columns: DatasetColumns) -> TensorDict:
+    episode = columns.episode
+    if episode is None:
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                episode = "episode" if "episode" in arrays else None
+        # read_npz says what is wrong with it.
+        except Exception:
+            episode = None
+    return read_npz(
+        path,
+        observation=columns.observation or "observation",
+        action=columns.action or "action",
+        episode=episode,
+        time=columns.time,
+    )
+
+
+def _saved(path: Path, columns: DatasetColumns) -> TensorDictBase:
+    try:
+        data = torch.load(path, weights_only=True, map_location="cpu")
+    # Damage takes any form, and so does a file that is none of torch's.
+    except Exception as error:
+        raise ValueError(
+            f"{path} cannot be read as plain tensors; write it by "
+            "torch.save(data.clone().to_dict(), file), or data.memmap(folder)"
+        ) from error
+    return _tensordict(path, data, columns)
+
+
+def _safetensors(path: Path, columns: DatasetColumns) -> TensorDictBase:
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        flat = load_file(path)
+    except SafetensorError as error:
+        raise ValueError(f"{path} is damaged, or no safetensors file: {error}") from error
+    data: dict[str, Any] = {}
+    for name, value in flat.items():
+        *places, last = re.split(r"[./]", name)
+        inner = data
+        for place in places:
+            inner = inner.setdefault(place, {})
+        inner[last] = value
+    return _tensordict(path, data, columns)
+
+
+def _tensordict(path: Path, data: Any, columns: DatasetColumns) -> TensorDictBase:
+    if isinstance(data, TensorDictBase):
+        return data
+    key, *more = columns.observation or ["observation"]
+    if more:
+        raise ValueError(f"{path}: tensordicts have one observation, not {columns.observation}")
+    if not isinstance(data, dict) or not isinstance(data.get(key), torch.Tensor):
+        raise ValueError(f"{path} holds no dictionary of tensors with {key!r} among them")
+    return TensorDict(data, batch_size=data[key].shape[:-1])
+
+
+def _folder(path: Path) -> TensorDictBase:
+    if (path / "config.yaml").is_file():
+        return _of_run(path)
+    for inside in (path, path / "data"):
+        if (inside / "metadata.json").is_file():
+            return _of_minari(inside)
+    if (path / "meta.json").is_file():
+        for pattern in _PICKLES:
+            for found in path.rglob(pattern):
+                raise ValueError(f"{found} is a pickle, which is not read; leave it out")
+        try:
+            return TensorDict.load_memmap(path)
+        # What damaged files raise has no common class.
+        except Exception as error:
+            raise ValueError(f"{path} is no tensordict that can be read: {error}") from error
+    raise ValueError(
+        f"{path} holds no dataset: no run (config.yaml), no tensordict (meta.json), none of "
+        "Minari's (metadata.json)"
+    )
+
+
+def _of_run(path: Path) -> TensorDictBase:
+    """The replay buffer of a run's last checkpoint that can be read."""
+    problems = []
+    for name in _CHECKPOINTS:
+        try:
+            buffer = read_checkpoint(path / name)["algorithm"].get("buffer")
+        except RunDirectoryError as error:
+            problems.append(str(error))
+            continue
+        if not buffer:
+            raise ValueError(f"{path} is a run that has no real transitions")
+        return TensorDict(buffer).auto_batch_size_(1)
+    raise ValueError(f"{path} is a run without data: {problems[0]}")
+
+
+def _of_minari(path: Path) -> TensorDictBase:
+    try:
+        from minari import MinariDataset
+    except ModuleNotFoundError:
+        raise ValueError(
+            f"{path} is a Minari dataset, which needs Minari: pip install 'torchrl-l1[minari]'"
+        ) from None
+    try:
+        dataset = MinariDataset(path)
+    # What Minari raises of a damaged folder has no common class.
+    except Exception as error:
+        raise ValueError(f"{path} is no Minari dataset that can be read: {error}") from error
+    return read_minari(dataset)
+
+
+def _named(source: str, data: TensorDictBase, columns: DatasetColumns) -> TensorDictBase:
+    """The data with the usual names."""
+    for name, given in (("observation", columns.observation), ("action", columns.action)):
+        if name in data.keys():  # noqa: SIM118
+            continue
+        if len(given) != 1 or data.get(given[0], None) is None:
+            there = ", ".join(sorted(map(str, data.keys())))
+            raise KeyError(f"{source} has no {name}, only {there}: name it, columns.{name}=[...]")
+        data = data.set(name, data[given[0]])
+        if ("next", given[0]) in data.keys(True):
+            data = data.set(("next", name), data["next", given[0]])
+    return data
+
+
+@dataclass(frozen=True)
+class Episode:
+    """An episode of L steps, float32.
+
+    Attributes:
+        observations: ``(L + 1, n)``, the last one included.
+        actions: ``(L, m)``.
+        rewards: ``(L,)``.
+        terminations: ``(L,)``, bool.
+        truncations: ``(L,)``, bool; the last one is true where nothing else has ended it.
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    terminations: np.ndarray
+    truncations: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+
+def split_episodes(data: TensorDictBase) -> list[Episode]:
+    """The episodes in ``[N, T]`` steps of environments, in order.
+
+    An episode that the end of the data cuts off is truncated there. A step that the simulator
+    could not take did not happen, and the episode is truncated before it.
+    """
+    columns = {
+        "action": data["action"].float(),
+        "reward": data["next", "reward"].float().squeeze(-1),
+        "terminated": data["next", "terminated"].squeeze(-1),
+        "truncated": data["next", "truncated"].squeeze(-1),
+    }
+    before, after = data["observation"].float(), data["next", "observation"].float()
+    bad = data.get(("next", "non_finite"), torch.zeros_like(data["next", "done"])).squeeze(-1)
+    done = data["next", "done"].squeeze(-1)
+    episodes = []
+    for row in range(data.shape[0]):
+        ends = [int(end) + 1 for end in done[row].nonzero()]
+        for first, last in zip([0, *ends], [*ends, data.shape[1]], strict=True):
+            last -= int(bad[row, first:last].any())
+            if last <= first:
+                continue
+            part = {name: value[row, first:last].numpy() for name, value in columns.items()}
+            truncated = part["truncated"].copy()
+            truncated[-1] |= not part["terminated"][-1]
+            seen = torch.cat([before[row, first:last], after[row, last - 1 : last]]).numpy()
+            episodes.append(
+                Episode(seen, part["action"], part["reward"], part["terminated"], truncated)
+            )
+    return episodes
+
+
+def write_dataset(output: str, episodes: Sequence[Episode], task: Task, algorithm: str) -> str:
+    """Write episodes where :func:`read_dataset` finds them again.
+
+    Args:
+        output: a ``.npz`` file; a name with a version, such as ``hopper/medium-v0``, for a Minari
+            dataset, which needs the extra ``minari``; or a folder for a memory-mapped tensordict.
+        episodes: at least one.
+        task: what they are of.
+        algorithm: what they were made by, for Minari.
+
+    Returns:
+        what to give as ``dataset``.
+
+    Raises:
+        ValueError: if there is something already, or no Minari for it.
+    """
+    path = Path(output)
+    check_output(output)
+    if path.suffix == ".npz":
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(path, **_rows(episodes))  # type: ignore[arg-type]
+    elif _MINARI_NAME.fullmatch(output):
+        _write_minari(output, episodes, task, algorithm)
+    else:
+        _transitions(episodes).memmap(path)
+    return output
+
+
+def check_output(output: str) -> None:
+    """Refuse a place for a dataset before it is made.
+
+    Raises:
+        ValueError: if there is something already, or no Minari for a name of its kind.
+    """
+    path = Path(output)
+    if path.exists():
+        raise ValueError(f"{output} is there already: choose another place, or remove it")
+    if path.suffix == ".npz":
+        return
+    if path.suffix and not _MINARI_NAME.fullmatch(output):
+        raise ValueError(f"{output}: datasets are .npz files, folders, or Minari's (name-v0)")
+    if _MINARI_NAME.fullmatch(output):
+        try:
+            import minari
+
+            import_module("h5py")  # what Minari stores its data with
+        except ModuleNotFoundError:
+            raise ValueError(
+                f"{output} is the name of a Minari dataset, which needs Minari: pip install "
+                "'torchrl-l1[minari]', or choose a .npz file"
+            ) from None
+        if output in minari.list_local_datasets():
+            raise ValueError(f"Minari has a dataset {output} already: choose another name")
+
+
+def _rows(episodes: Sequence[Episode]) -> dict[str, np.ndarray]:
+    """One row per sampling instant, the last one of each episode without an action of its own."""
+
+    def column(name: str) -> np.ndarray:
+        parts = []
+        for episode in episodes:
+            values = getattr(episode, name)
+            parts += [values, np.zeros_like(values[:1])]
+        return np.concatenate(parts)
+
+    return {
+        "observation": np.concatenate([episode.observations for episode in episodes]),
+        "action": column("actions"),
+        "reward": column("rewards"),
+        "terminated": column("terminations"),
+        "truncated": column("truncations"),
+        "episode": np.repeat(np.arange(len(episodes)), [len(episode) + 1 for episode in episodes]),
+    }
+
+
+def _transitions(episodes: Sequence[Episode]) -> TensorDict:
+    """As TorchRL's collectors give them, one after the other."""
+
+    def column(name: str) -> torch.Tensor:
+        return torch.from_numpy(np.concatenate([getattr(episode, name) for episode in episodes]))
+
+    terminated, truncated = column("terminations")[:, None], column("truncations")[:, None]
+    lengths = [len(episode) for episode in episodes]
+    none = torch.zeros_like(terminated)
+    return TensorDict(
+        {
+            "observation": torch.cat([torch.from_numpy(e.observations[:-1]) for e in episodes]),
+            "action": column("actions"),
+            "done": none,
+            "terminated": none.clone(),
+            "truncated": none.clone(),
+            "next": {
+                "observation": torch.cat([torch.from_numpy(e.observations[1:]) for e in episodes]),
+                "reward": column("rewards")[:, None],
+                "done": terminated | truncated,
+                "terminated": terminated,
+                "truncated": truncated,
+            },
+            "collector": {
+                "traj_ids": torch.arange(len(episodes)).repeat_interleave(torch.tensor(lengths))
+            },
+        },
+        batch_size=[sum(lengths)],
+    )
+
+
+def _write_minari(name: str, episodes: Sequence[Episode], task: Task, algorithm: str) -> None:
+    import minari
+    from gymnasium.spaces import Box
+    from minari.data_collector.episode_buffer import EpisodeBuffer
+
+    buffers = [
+        EpisodeBuffer(
+            id=number,
+            observations=list(episode.observations),
+            actions=list(episode.actions),
+            rewards=list(episode.rewards),
+            terminations=list(episode.terminations),
+            truncations=list(episode.truncations),
+            infos={},
+        )
+        for number, episode in enumerate(episodes)
+    ]
+    n, m = task.observation_dim, task.action_dim
+    minari.create_dataset_from_buffers(
+        name,
+        buffers,
+        env=gymnasium_id(task.name) if task.name in EPISODE_STEPS else None,
+        observation_space=Box(-np.inf, np.inf, (n,), np.float32),
+        action_space=Box(task.action_low, task.action_high, (m,), np.float32),
+        algorithm_name=algorithm,
+    )
