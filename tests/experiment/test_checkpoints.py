@@ -16,11 +16,14 @@ from omegaconf import DictConfig
 
 from torchrl_l1.cli import main
 from torchrl_l1.deployment import load_target
-from torchrl_l1.experiment.checkpoints import keep_checkpoints, read_checkpoint
+from torchrl_l1.experiment.checkpoints import (
+    CheckpointSettings,
+    keep_checkpoints,
+    read_checkpoint,
+)
 from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.settings import CheckpointSettings
 
 Recipe = Callable[..., DictConfig]
 KEEP = ("checkpoint.every=2", "checkpoint.best=true")

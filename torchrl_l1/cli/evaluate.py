@@ -19,6 +19,7 @@ from torchrl_l1.envs.rendering import (
     filmstrip,
     rollout_frames,
 )
+from torchrl_l1.experiment.checkpoints import CheckpointSettings
 from torchrl_l1.experiment.evaluate import (
     TrainedRun,
     distinct,
@@ -38,7 +39,7 @@ from torchrl_l1.experiment.matrix import (
     conditions,
 )
 from torchrl_l1.experiment.recipes import group_setting
-from torchrl_l1.experiment.settings import CheckpointSettings, RunSettings, WandbSettings
+from torchrl_l1.experiment.settings import RunSettings, WandbSettings
 from torchrl_l1.experiment.tracking import Evaluated, log_evaluation
 from torchrl_l1.report.evaluation_figures import RANGES, plot_disturbances
 from torchrl_l1.report.evaluation_summary import summarize, summary_tables

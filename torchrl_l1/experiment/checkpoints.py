@@ -7,6 +7,7 @@ import pickle
 import warnings
 import zipfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,23 @@ import torch
 from torchrl_l1.algorithms import Algorithm
 from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.files import copy_in_place
-from torchrl_l1.experiment.settings import CheckpointSettings
 
 KEPT = "checkpoints"
 """Folder in a run directory of the checkpoints that a recipe keeps."""
+
+
+@dataclass
+class CheckpointSettings:
+    """Checkpoints that are kept, beside the last one and the one before it.
+
+    Attributes:
+        every: outer iterations after which one is kept, again and again; none if null.
+        best: whether that of the highest ``return_mean`` is kept.
+    """
+
+    every: int | None = None
+    best: bool = False
+
 
 _ENTRIES = {"algorithm": dict, "metrics": list, "timings": list}
 

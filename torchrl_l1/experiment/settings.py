@@ -32,6 +32,7 @@ from torchrl_l1.checks import check_choice, check_count, check_optional_count
 from torchrl_l1.compilation import check_mode
 from torchrl_l1.control import L1Config
 from torchrl_l1.envs import get_task
+from torchrl_l1.experiment.checkpoints import CheckpointSettings
 from torchrl_l1.experiment.datasets import read_dataset
 from torchrl_l1.experiment.files import bounded_overrides
 
@@ -105,19 +106,6 @@ class WandbSettings:
     name: str | None = None
     tags: list[str] = field(default_factory=list)
     notes: str | None = None
-
-
-@dataclass
-class CheckpointSettings:
-    """Checkpoints that are kept, beside the last one and the one before it.
-
-    Attributes:
-        every: outer iterations after which one is kept, again and again; none if null.
-        best: whether that of the highest ``return_mean`` is kept.
-    """
-
-    every: int | None = None
-    best: bool = False
 
 
 @dataclass
