@@ -35,6 +35,7 @@ from torchrl_l1.algorithms.collection import (
 from torchrl_l1.algorithms.facts import AlgorithmFacts, Phase, Stage
 from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.offline_config import OfflineConfig
+from torchrl_l1.algorithms.outcomes import OUTCOME_METRICS
 from torchrl_l1.algorithms.pessimism import PENALTY_METRICS, Pessimism
 from torchrl_l1.algorithms.policy import GaussianPolicy, acting
 from torchrl_l1.algorithms.policy_improvement import (
@@ -104,7 +105,9 @@ class Offline(Algorithm):
             "evaluate": Phase("evaluating", "measuring returns"),
         },
         metrics={
-            **COMMON_METRICS,
+            **{
+                name: words for name, words in COMMON_METRICS.items() if name not in OUTCOME_METRICS
+            },
             "real_steps": "Transitions of the dataset; those of measurements do not count.",
             "return_mean": "Mean return of `evaluation_episodes` real episodes with sampled "
             "actions, with L1 if it is on. Nothing is learned from them.",
