@@ -12,7 +12,7 @@ from torchrl_l1.checks import check_count
 from torchrl_l1.deployment import Assessment, RobustController, robustify
 from torchrl_l1.deployment.robust_controller import PRESETS
 from torchrl_l1.envs import DISTURBANCES, SUITES
-from torchrl_l1.experiment.files import write_atomically, write_table
+from torchrl_l1.experiment.files import bounded, write_atomically, write_table
 from torchrl_l1.experiment.run import MODES, check_wandb_mode
 
 _PROJECT = "torchrl_l1"
@@ -71,6 +71,7 @@ def robustify_command(options: argparse.Namespace) -> None:
     output = Path(options.output or Path("runs/robustify", _folder(options.env)))
     if output.exists() and not output.is_dir():
         raise ValueError(f"{output} is a file; choose another --output")
+    output.mkdir(parents=True, exist_ok=True)
     robust = robustify(
         options.env,
         options.policy,
@@ -105,7 +106,7 @@ def robustify_command(options: argparse.Namespace) -> None:
 
 
 def _folder(env: str) -> str:
-    return "".join(letter if letter.isalnum() or letter in "._-" else "_" for letter in env)
+    return bounded("".join(c if c.isalnum() or c in "._-" else "_" for c in env))
 
 
 def _some_biases(robust: RobustController) -> dict[str, list[float]]:

@@ -46,6 +46,7 @@ _REMEDIES = {
     errno.ENOTEMPTY: "something is in the way; move it away",
     errno.ELOOP: "a symbolic link is in the way; remove it",
     errno.EMFILE: "too many files are open; raise the limit (ulimit -n)",
+    errno.EFBIG: "raise the limit on the size of files (ulimit -f), and the same command goes on",
     errno.EIO: "the disk fails; choose another place",
 }
 _LONGEST = 2000
