@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import random
 import shutil
 import signal
@@ -18,11 +19,13 @@ import sys
 import tempfile
 import time
 import warnings
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import safetensors.torch
 
 from tests.conftest import TINY
 from torchrl_l1.campaign.description import dump_yaml, read_campaign
@@ -31,6 +34,7 @@ from torchrl_l1.campaign.plan import plan
 from torchrl_l1.cli import main as command
 from torchrl_l1.deployment import RobustController, robustify
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, read_csv, read_npz
+from torchrl_l1.dynamics.storage import _digest
 from torchrl_l1.experiment.checkpoints import read_checkpoint
 from torchrl_l1.experiment.errors import USER_ERRORS, message
 from torchrl_l1.experiment.evaluate import load_run
@@ -105,6 +109,34 @@ def mutated(content: bytes, rng: random.Random) -> bytes:
     return content
 
 
+def mutated_inside(content: bytes, rng: random.Random) -> bytes:
+    """One part of a ZIP archive changed, and all checksums as they should be."""
+    written = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(written, "w") as new:
+        # Torch keeps all but the tensors' numbers in one part.
+        names = [name for name in old.namelist() if name.endswith("data.pkl")] or old.namelist()
+        chosen = rng.choice(names)
+        for name in old.namelist():
+            part = old.read(name)
+            new.writestr(name, mutated(part, rng) if name == chosen else part)
+    return written.getvalue()
+
+
+def mutated_settings(content: bytes, rng: random.Random) -> bytes:
+    """The settings in a model's file changed, and its checksum as it should be."""
+    tensors = safetensors.torch.load(content)
+    length = int.from_bytes(content[:8], "little")
+    metadata = json.loads(content[8 : 8 + length])["__metadata__"]
+    settings = mutated(metadata["settings"].encode(), rng).decode(errors="replace")
+    digest = _digest(settings, tensors.items())
+    return safetensors.torch.save(tensors, {**metadata, "settings": settings, "sha256": digest})
+
+
+Mutator = Callable[[bytes, random.Random], bytes]
+# Files are named with what of them is changed behind a comma.
+MUTATORS: dict[str, Mutator] = {"inside": mutated_inside, "settings": mutated_settings}
+
+
 @dataclass
 class Result:
     """What came of the mutations of a file."""
@@ -123,6 +155,11 @@ def read_run_of_report(folder: Path) -> None:
     found = find_readable_runs([folder / "run"])
     studies(found.runs)
     RunDirectory(folder / "run").iterations_done()
+
+
+def read_older_run(folder: Path) -> None:
+    studies(find_readable_runs([folder / "older"]).runs)
+    RunDirectory(folder / "older").iterations_done()
 
 
 def read_settings(folder: Path) -> None:
@@ -202,6 +239,10 @@ def whole_report(folder: Path) -> None:
     command(["report", str(folder / "run"), "--output", str(folder.parent / "report")])
 
 
+def whole_report_of_older_run(folder: Path) -> None:
+    command(["report", str(folder / "older"), "--output", str(folder.parent / "report")])
+
+
 def whole_report_of_campaign(folder: Path) -> None:
     command(["report", str(folder), "--output", str(folder.parent / "report")])
 
@@ -230,11 +271,13 @@ Reader = Callable[[Path], None]
 FILES: dict[str, list[Reader]] = {
     "run/config.yaml": [read_run_of_report, read_settings, some_run, whole_report],
     "run/metrics.csv": [read_run_of_report, whole_report],
+    "older/metrics.csv": [read_older_run, whole_report_of_older_run],
     "run/timing.csv": [read_run_of_report, whole_report],
     "run/checksums.json": [read_run_of_report, whole_report],
     "run/versions.json": [read_run_of_report, whole_report],
     "run/diverged.txt": [read_run_of_report, whole_report],
     "run/checkpoint.pt": [read_last_checkpoint, some_run, whole_evaluation],
+    "run/checkpoint.pt, inside": [read_last_checkpoint, some_run, whole_evaluation],
     "run/evaluations/noisy.csv": [read_run_of_report, whole_report],
     "run/evaluations/episodes/noisy.csv": [read_run_of_report, whole_report],
     "run/evaluations/noisy.yaml": [read_described, whole_campaign],
@@ -242,10 +285,13 @@ FILES: dict[str, list[Reader]] = {
     "mine.yaml": [read_campaign_file, some_plan, whole_campaign],
     "own.yaml": [read_recipe, some_composition],
     "traces.npz": [read_traces],
+    "traces.npz, inside": [read_traces],
     "controller/controller.json": [read_controller, whole_export],
     "controller/model.safetensors": [read_model, some_controller, whole_export],
+    "controller/model.safetensors, settings": [read_model, some_controller, whole_export],
     "drive.csv": [read_drive],
     "drive.npz": [read_arrays],
+    "drive.npz, inside": [read_arrays],
     "curves.csv": [read_curves, whole_report_with_curves],
 }
 
@@ -255,6 +301,9 @@ def make(folder: Path) -> None:
     directory = run(compose("metrpo/inverted_pendulum", [*TINY, f"run_dir={folder / 'run'}"]))
     shutil.copyfile(directory / "config.yaml", folder / "whole.yaml")
     (directory / "diverged.txt").write_text("training diverged in iteration 1, fit: a weight\n")
+    # Of a version that wrote no checksums, so that all that is told is told by the table.
+    shutil.copytree(directory, folder / "older")
+    (folder / "older/checksums.json").unlink()
     evaluation = {"name": "noisy", "l1": ["off", "paper"], "noise": ["action"], "episodes": 2}
     evaluate_run(str(directory), "noisy", {k: v for k, v in evaluation.items() if k != "name"})
     matrix = {"l1": ["off"], "seed": [0, 1]}
@@ -369,12 +418,13 @@ def fuzz(number: int, seed: int, root: Path, names: Sequence[str] = ()) -> dict[
 def _fuzz_one(
     folder: Path, number: int, rng: random.Random, name: str, readers: Sequence[Reader]
 ) -> Result:
-    file, result = folder / name, Result()
+    place, _, part = name.partition(", ")
+    file, result, mutate = folder / place, Result(), MUTATORS.get(part, mutated)
     whole = file.read_bytes()
     before = listing(folder, file)
     periods = {"some": SOME, "whole": WHOLE}
     for count in range(number):
-        file.write_bytes(mutated(whole, rng))
+        file.write_bytes(mutate(whole, rng))
         for reader in readers:
             if count % periods.get(reader.__name__.partition("_")[0], 1) == 0:
                 attempt(reader, folder, result, f"{name} #{count} {reader.__name__}")

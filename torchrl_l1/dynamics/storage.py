@@ -114,7 +114,9 @@ def _restored(
 ) -> EnsembleDynamics:
     sizes = [settings["observation_dim"] + settings["action_dim"], *settings["hidden"]]
     weights = settings["members"] * sum(a * b for a, b in pairwise(sizes))
-    if weights > sum(value.numel() for value in tensors.values()):
+    # Before any memory is asked for.
+    largest = max(*sizes, weights, settings["members"], settings["head"].get("dim", 0))
+    if largest > sum(value.numel() for value in tensors.values()):
         raise ValueError("its layers are larger than the file")
     kind, head, quality = (settings.pop(name) for name in ("form", "head", "quality"))
     gaussian = head.pop("name") == "gaussian"
