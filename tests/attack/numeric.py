@@ -35,6 +35,8 @@ STRANGE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf, "1e30": 1e30, "-
 
 
 def rows(attack: Attack) -> list[Row]:
+    """Settings, the controller, models, data and whole trainings."""
+    warnings.filterwarnings("ignore")
     return [settings(attack), controllers(attack), models(), data(), *trainings(attack)]
 
 
@@ -128,7 +130,7 @@ def _controller(
                 return f"the action is {u.flatten().tolist()}"
             if t > at + after and not torch.allclose(u, wanted, atol=1e-3):
                 return f"not forgotten: {u.flatten().tolist()}"
-            x = x + wanted @ gain
+            x = x + u.nan_to_num() @ gain
             actions.append(u[0].clone())
         found.append(torch.stack(actions))
     return None if torch.equal(*found) else "the other environment saw it"

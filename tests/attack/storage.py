@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import os
-import resource
+import re
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from tests.attack.kills import METRPO_TINY
 from tests.attack.outcome import Attack, Row, Said, changes, command, contents
@@ -20,10 +21,11 @@ from torchrl_l1.campaign.description import dump_yaml
 
 RECIPE = "metrpo/inverted_pendulum"
 OVERRIDES = [*METRPO_TINY, "outer_iterations=2", "fit.max_epochs=2"]
-NOBODY = 65534
 
 # The lines of a shell that does nothing but start the command, with its output somewhere.
 SHELL = [sys.executable, "-m", "torchrl_l1.cli"]
+
+NAMES = {"disk": "a full one, of a few kB", "disk full": "full from some file on"}
 
 
 @dataclass
@@ -71,23 +73,30 @@ def writers(folder: Path) -> list[Writer]:
 # What is done to a process before it is a command.
 
 
-def become_nobody() -> None:
-    """A user who owns nothing, as root may do everything."""
-    os.setgroups([])
-    os.setgid(NOBODY)
-    os.setuid(NOBODY)
+def obey_modes() -> None:
+    """Root may write what nobody may: without these capabilities it may not."""
+    if os.geteuid() != 0:
+        return
+    libc = ctypes.CDLL(None, use_errno=True)
+    header = (ctypes.c_uint32 * 2)(0x20080522, 0)  # the version of the structures, this process
+    found = (ctypes.c_uint32 * 6)()
+    libc.capget(header, found)
+    for part in (0, 1):  # effective and permitted
+        found[part] &= ~(1 << 1 | 1 << 2)  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH
+    if libc.capset(header, found) != 0:
+        raise OSError(ctypes.get_errno(), "capset")
 
 
-def limit_files(size: int) -> None:
-    """No file may grow beyond so many bytes."""
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+def fail_writing(at: int) -> None:
+    """From its n-th file on this process and its children find the disk full, only just."""
+    sync, count = os.fsync, iter(range(10**9))
 
+    def failing(handle: int) -> None:
+        if next(count) >= at:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        sync(handle)
 
-def limit_descriptors(number: int) -> None:
-    """So many more files may be open than now."""
-    here = len(os.listdir("/proc/self/fd"))
-    resource.setrlimit(resource.RLIMIT_NOFILE, (here + number, here + number))
+    os.fsync = failing
 
 
 def _private_mounts() -> None:
@@ -166,21 +175,20 @@ def _link_to_itself(folder: Path) -> Path:
 
 
 def faults() -> list[Fault]:
-    full, limit = "free some space", "limit"
+    full = "free some space"
     sizes = (4096, 16384, 40960)
     return [
         *(
-            Fault(f"disk full ({size // 1024} kB)", full, partial(_tiny, size=size), _made)
+            Fault(f"disk of {size // 1024} kB", full, partial(_tiny, size=size), _made)
             for size in sizes
         ),
         *(
-            Fault(f"files limited to {size} bytes", limit, partial(_limited, size=size), _made,
-                  stays=True)
-            for size in (0, 300, 3000)
+            Fault(f"disk full from file {at} on", full, partial(_failing, at=at), _made, stays=True)
+            for at in (0, 2, 5)
         ),
         Fault("read-only file system", "can be written to", partial(_partial, mount_read_only),
               _made),
-        Fault("no permission", "permissions", lambda folder: become_nobody, _made, stays=True),
+        Fault("no permission", "permissions", lambda folder: obey_modes, _forbidden, stays=True),
         Fault("a file in the way", "is a file|in the way|is not empty", spoil=_file_in_the_way),
         Fault("below a file", "in the way|is a file", spoil=_below_a_file),
         Fault("name too long", "shorter name", spoil=_too_long),
@@ -192,8 +200,8 @@ def _tiny(folder: Path, size: int) -> Callable[[], object]:
     return partial(mount_tiny, folder, size)
 
 
-def _limited(folder: Path, size: int) -> Callable[[], object]:
-    return partial(limit_files, size)
+def _failing(folder: Path, at: int) -> Callable[[], object]:
+    return partial(fail_writing, at)
 
 
 def _partial(function: Callable[[Path], object], folder: Path) -> Callable[[], object]:
@@ -206,17 +214,14 @@ def rows(attack: Attack) -> list[Row]:
     if attack.quick:
         every = [writer for writer in every if writer.name in ("run", "report")]
     mounts = may_mount()
-    root = hasattr(os, "geteuid") and os.geteuid() == 0
     found: dict[str, Row] = {}
     before = contents(attack.folder / "run")
     for fault in faults():
-        kind = fault.name.partition(" (")[0].partition(" to ")[0]
-        row = found.setdefault(kind, Row(f"disk: {kind}"))
-        if ("full" in kind or "read-only" in kind) and mounts:
+        kind = re.sub(r" (of \d+ kB|from file \d+ on)$", "", fault.name)
+        row = found.setdefault(kind, Row(f"disk: {NAMES.get(kind, kind)}"))
+        if kind in ("disk", "read-only file system") and mounts:
             row.skipped.append(mounts)
             continue
-        if kind == "no permission" and not root:
-            fault = Fault(fault.name, fault.words, spoil=_forbidden, stays=True)
         for writer in every:
             under(row, writer, fault, attack.folder, before)
     return [*found.values(), outputs(attack), links(attack)]
@@ -239,8 +244,7 @@ def under(row: Row, writer: Writer, fault: Fault, place: Path, before: dict[str,
     if folder.is_file() and folder.read_text() != "years of work":
         lost = "the file in the way"
     if not problem and fault.stays:
-        if os.geteuid() != 0:
-            folder.chmod(0o755)
+        folder.chmod(0o755)
         again = command(writer.make(at), log)
         if problem := again.problem():
             problem = f"does not go on: {problem}"
@@ -255,7 +259,7 @@ def _same_metrics(one: Path, other: Path) -> bool:
 
 def _told(said: Said, writer: Writer, fault: Fault, folder: Path) -> str | None:
     """A command that could not write says where and what to do; one that could is well, too."""
-    if said.status == 0 and not fault.name.startswith(("disk full", "files limited")):
+    if said.status == 0 and not fault.name.startswith("disk"):
         return "it went on as if nothing had been wrong"
     if said.status == 0:
         return said.problem()
@@ -265,8 +269,7 @@ def _told(said: Said, writer: Writer, fault: Fault, folder: Path) -> str | None:
         named = RECIPE in said.text and str(folder) in said.text
         told = any(word in said.text for word in fault.words.split("|"))
         return None if named and told else f"no run, place or remedy: {said.text[-300:]}"
-    # ``%`` of nothing else: names may be cut where they are long.
-    return said.refusal(str(folder)[:200], fault.words)
+    return said.refusal(re.escape(str(folder)), fault.words)
 
 
 def outputs(attack: Attack) -> Row:
@@ -282,17 +285,23 @@ def outputs(attack: Attack) -> Row:
     return row
 
 
+def _options() -> dict[str, Any]:
+    # ``argparse`` says nothing where its help cannot be written at once.
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
+    return {"stderr": subprocess.PIPE, "text": True, "env": environment}
+
+
 def _closed(arguments: Sequence[str]) -> str | None:
     read, write = os.pipe()
     os.close(read)
-    ended = subprocess.run([*SHELL, *arguments], stdout=write, stderr=subprocess.PIPE, text=True)
+    ended = subprocess.run([*SHELL, *arguments], stdout=write, **_options())
     os.close(write)
     return _one_line(ended)
 
 
 def _full(arguments: Sequence[str]) -> str | None:
     with open("/dev/full", "w") as full:
-        ended = subprocess.run([*SHELL, *arguments], stdout=full, stderr=subprocess.PIPE, text=True)
+        ended = subprocess.run([*SHELL, *arguments], stdout=full, **_options())
     return _one_line(ended)
 
 
