@@ -411,7 +411,8 @@ def fuzz(number: int, seed: int, root: Path, names: Sequence[str] = ()) -> dict[
                 )
                 if any(elsewhere.iterdir()):
                     results[name].wrong.append(f"{name}: files were written where it was called")
-                print(row(name, results[name]), file=sys.stderr, flush=True)
+                lines = [row(name, results[name]), *results[name].wrong[:20]]
+                print("\n".join(lines), file=sys.stderr, flush=True)
     return results
 
 

@@ -25,7 +25,9 @@ GROUPS: dict[str, Callable[[Attack], list[Row]]] = {
 }
 
 
-def attack(root: Path, quick: bool, seed: int, groups: list[str] | None = None) -> list[Row]:
+def attack(
+    root: Path, quick: bool, seed: int, groups: list[str] | None = None, match: str = ""
+) -> list[Row]:
     """All rows of the table; work goes on below ``root``, which others may look into."""
     rows = []
     for name, group in GROUPS.items():
@@ -34,7 +36,7 @@ def attack(root: Path, quick: bool, seed: int, groups: list[str] | None = None) 
         folder = root / name
         folder.mkdir()
         start = time.monotonic()
-        found = group(Attack(folder, quick, seed))
+        found = group(Attack(folder, quick, seed, match))
         seconds = time.monotonic() - start
         print(f"{name}: {seconds:.0f} s", file=sys.stderr, flush=True)
         rows += found
@@ -46,11 +48,12 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="some of each kind")
     parser.add_argument("--seed", type=int, default=0, help="of the moments of kills")
     parser.add_argument("--only", nargs="+", choices=list(GROUPS), help="these groups")
+    parser.add_argument("--match", default="", help="only what has this in its name")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as root:
         # Another user must get to what that user may not write.
         Path(root).chmod(0o755)
-        rows = attack(Path(root), options.quick, options.seed, options.only)
+        rows = attack(Path(root), options.quick, options.seed, options.only, options.match)
     print(table(rows))
     sys.exit(any(row.failures for row in rows))
 

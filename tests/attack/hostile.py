@@ -386,6 +386,8 @@ def rows(attack: Attack) -> list[Row]:
     _controller(source)
     found = []
     for kind, cases in KINDS.items():
+        if attack.match not in kind:
+            continue
         row = Row(kind)
         chosen = list(cases.items())
         for name, case in chosen[:: max(1, len(chosen) // 3)] if attack.quick else chosen:

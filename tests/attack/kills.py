@@ -148,6 +148,7 @@ def rows(attack: Attack) -> list[Row]:
     """Kills of runs and campaigns, and the signals that end a process in order."""
     every = ("METRPO", "PETS", "MBMF", "a campaign, one worker", "a campaign, two workers")
     chosen = every[:1] + every[-1:] if attack.quick else every
+    chosen = tuple(name for name in chosen if attack.match in name)
     found = []
     signals = Row("signals: SIGTERM, SIGINT, SIGHUP, SIGUSR1, one or two")
     for subject in subjects(attack.folder, chosen):

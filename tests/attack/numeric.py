@@ -37,7 +37,8 @@ STRANGE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf, "1e30": 1e30, "-
 def rows(attack: Attack) -> list[Row]:
     """Settings, the controller, models, data and whole trainings."""
     warnings.filterwarnings("ignore")
-    return [settings(attack), controllers(attack), models(), data(), *trainings(attack)]
+    first = [] if attack.match else [settings(attack), controllers(attack), models(), data()]
+    return [*first, *trainings(attack)]
 
 
 # Settings.
@@ -326,6 +327,8 @@ def trainings(attack: Attack) -> list[Row]:
     """Each way in which each algorithm goes wrong, with ``on_divergence`` stop and warn."""
     found = []
     for name in ("METRPO",) if attack.quick else RUNS:
+        if attack.match not in name:
+            continue
         recipe, overrides = RUNS[name]
         healthy = attack.folder / f"{name}_healthy"
         arguments = ["run", recipe, *overrides, "--resume"]

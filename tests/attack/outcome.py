@@ -70,11 +70,13 @@ class Attack:
         folder: of the group, empty at first.
         quick: whether a few of each kind will do.
         seed: of what is random.
+        match: part of the names of what is tried.
     """
 
     folder: Path
     quick: bool
     seed: int
+    match: str = ""
 
     def random(self, name: str) -> random.Random:
         """A stream of random numbers of its own."""

@@ -217,6 +217,8 @@ def rows(attack: Attack) -> list[Row]:
     found: dict[str, Row] = {}
     before = contents(attack.folder / "run")
     for fault in faults():
+        if attack.match not in fault.name:
+            continue
         kind = re.sub(r" (of \d+ kB|from file \d+ on)$", "", fault.name)
         row = found.setdefault(kind, Row(f"disk: {NAMES.get(kind, kind)}"))
         if kind in ("disk", "read-only file system") and mounts:
@@ -224,7 +226,8 @@ def rows(attack: Attack) -> list[Row]:
             continue
         for writer in every:
             under(row, writer, fault, attack.folder, before)
-    return [*found.values(), outputs(attack), links(attack)]
+    rest = [] if attack.match else [outputs(attack), links(attack)]
+    return [*found.values(), *rest]
 
 
 def _forbidden(folder: Path) -> Path:
