@@ -369,8 +369,10 @@ def _train(
     if not problem and (marked or said.status == 1):
         page = command(["report", str(folder), "--output", f"{folder}_report"], log)
         text = Path(f"{folder}_report", "report.md")
-        if table and (page.problem() or "diverged" not in text.read_text()):
-            problem = page.problem() or "not in the report"
+        told = page.text + (text.read_text() if text.exists() else "")
+        # Returns of no number enter no report; then the reason is told.
+        if table and (page.problem((0, 1)) or "training diverged in" not in told):
+            problem = page.problem((0, 1)) or "not in the report"
     lost = None
     if not problem and said.status == 1 and not way.overrides:
         again = command(arguments, log)

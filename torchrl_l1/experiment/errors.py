@@ -23,7 +23,6 @@ class RunDirectoryInUse(RunDirectoryError):
     """Another process is running in the run directory."""
 
 
-
 @contextmanager
 def fitting_into_memory(what: str) -> Iterator[None]:
     """Say in a line what is too large for this machine, as sizes in a file may be.
