@@ -2,7 +2,7 @@
 
 Kills at random moments, disks that fail, hostile files, numbers that are none: each kind is tried
 many times. The table says how often, how often it was survived, and whether anything was lost; the
-status is 1 unless all is well. The whole takes some ten minutes, ``--quick`` less than one.
+status is 1 unless all is well. The whole takes minutes, ``--quick`` tries some of each kind.
 """
 
 from __future__ import annotations
