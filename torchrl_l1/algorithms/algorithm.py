@@ -320,7 +320,8 @@ class Algorithm(ABC):
         error = Diverged(self.iteration, self._phase, what, setting)
         if self.stops_on_divergence:
             raise error
-        if str(error) not in map(str, self._diverged):
+        # What a phase has noted need not be said again at the end of the iteration.
+        if not any(f": {what}; " in str(noted) for noted in self._diverged):
             self._diverged.append(error)
 
     def _check_finite(self, metrics: Mapping[str, float]) -> None:

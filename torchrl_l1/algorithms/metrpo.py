@@ -125,6 +125,8 @@ class METRPO(Algorithm):
                         steps.append(self.improvement.step(self.learning.buffer))
                     except ValueError as error:
                         self.diverged(str(error), "imagined_horizon, discount and policy.std")
+                improvement = policy_metrics(steps)
+                self._check_finite(improvement)
                 self._check_weights("policy", self.policy)
 
             with self.phase("collect"):
@@ -141,7 +143,7 @@ class METRPO(Algorithm):
                 **returns,
                 **signal_metrics(data),
                 **fit,
-                **policy_metrics(steps),
+                **improvement,
                 "policy/std": self.policy.log_std.detach().exp().mean().item(),
             }
             yield self.complete((iteration + 2) * self.collection.frames, metrics)

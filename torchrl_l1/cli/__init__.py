@@ -70,7 +70,11 @@ def main(argv: Sequence[str] | None = None) -> None:
         help="write a copy to edit: of a recipe or campaign, to NAME.yaml or a file of your choice",
     )
 
-    options, rest = parser.parse_known_args(arguments)
+    try:
+        options, rest = parser.parse_known_args(arguments)
+    except SystemExit:
+        _flush(" ".join(arguments[:1]))  # the help that was asked for
+        raise
     overridden = options.command == "campaign" and not any(o.startswith("-") for o in rest)
     if rest and options.command != "run" and not overridden:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
@@ -109,14 +113,32 @@ def _dispatch(options: argparse.Namespace, rest: list[str]) -> None:
                 sys.exit(1)
         else:
             _recipes(options.copy)
-        sys.stdout.flush()  # while a broken pipe can still be named
+    except SystemExit:
+        _flush(options.command)
+        raise
     except USER_ERRORS as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
+        _flush(options.command)
         print(f"torchrl-l1 {options.command}: {message(error)}", file=sys.stderr)
-        if isinstance(error, BrokenPipeError):
-            # Nothing more can be written there, not even when the interpreter ends.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    _flush(options.command)
+
+
+def _flush(command: str) -> None:
+    """Write what is left of the output, while it can still be told that this fails.
+
+    Exits with status 1 if it does.
+    """
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        from torchrl_l1.experiment.errors import message
+
+        where = "" if isinstance(error, BrokenPipeError) else "standard output: "
+        print(f"torchrl-l1 {command}: {where}{message(error)}", file=sys.stderr)
+        # Nothing more can be written there, not even when the interpreter ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
 
 

@@ -6,7 +6,9 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import mujoco
@@ -19,11 +21,12 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_l1.algorithms.collection import seed_streams, stream_seed
+from torchrl_l1.atomic import write_atomically, write_through
 from torchrl_l1.control import L1Transform
 from torchrl_l1.deployment.environments import require, simulation_of
 from torchrl_l1.deployment.learning import policy_transforms
 from torchrl_l1.deployment.robust_controller import RobustController
-from torchrl_l1.envs.rendering import draw_poses, rollout_frames
+from torchrl_l1.envs.rendering import draw_poses, rollout_frames, write_gif
 from torchrl_l1.experiment.l1_options import OFF
 
 SUFFIXES = (".mp4", ".gif")
@@ -199,15 +202,20 @@ def write_film(frames: Sequence[np.ndarray], file: str | Path, dt: float) -> Pat
     if file.suffix == ".gif":
         images = [Image.fromarray(frame) for frame in frames]
         duration = max(20, round(1000 * seconds))
-        images[0].save(file, save_all=True, append_images=images[1:], duration=duration, loop=0)
+        write_through(file, partial(write_gif, images, duration))
         return file
     ffmpeg = require("imageio_ffmpeg", "video")
     height, width = (side - side % 2 for side in frames[0].shape[:2])  # as the format asks
-    writer = ffmpeg.write_frames(str(file), (width, height), fps=1 / seconds, macro_block_size=2)
-    writer.send(None)
-    for frame in frames:
-        writer.send(np.ascontiguousarray(frame[:height, :width]))
-    writer.close()
+    with TemporaryDirectory() as folder:
+        film = Path(folder, "film.mp4")
+        writer = ffmpeg.write_frames(
+            str(film), (width, height), fps=1 / seconds, macro_block_size=2
+        )
+        writer.send(None)
+        for frame in frames:
+            writer.send(np.ascontiguousarray(frame[:height, :width]))
+        writer.close()
+        write_atomically(file, film.read_bytes())
     return file
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,6 +17,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase, TransformedEnv
 from tqdm import tqdm
 
+from torchrl_l1.atomic import write_atomically
 from torchrl_l1.checks import check_choice, check_count, check_not_negative, check_positive
 from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.control.layout import Layout
@@ -39,7 +39,7 @@ from torchrl_l1.deployment.policies import Policy, load_policy
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, calibrate_filter, fit_dynamics
 from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
-from torchrl_l1.experiment.files import write_atomically
+from torchrl_l1.experiment.files import read_text
 from torchrl_l1.experiment.l1_options import OFF, closest_option, l1_option
 from torchrl_l1.experiment.settings import l1_config
 
@@ -53,6 +53,7 @@ FIT = FitConfig(max_epochs=200, max_gradient_steps=2000, patience=10, batch_size
 """How the model is fitted where nothing else is said."""
 
 _FORMAT = 1
+_MOST_BYTES = 1_000_000
 _FILE, _MODEL = "controller.json", "model.safetensors"
 
 
@@ -233,18 +234,25 @@ def _copied(file: Path, folder: Path, role: str) -> str:
     # With its role, since files of different folders may have one name.
     target = folder / (file.name if file.name.startswith(role) else f"{role}_{file.name}")
     if file.resolve() != target.resolve():
-        shutil.copyfile(file, target)
+        write_atomically(target, file.read_bytes())
     return target.name
 
 
 def _read(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
     """What a controller's file holds, and its settings of L1."""
     try:
-        stored = json.loads(file.read_text(encoding="utf-8"))
+        stored = json.loads(read_text(file, _MOST_BYTES))
         if stored["format"] == _FORMAT:
-            _ = stored["environment"], stored["policy"], stored["preset"]
-            return stored, {name: L1Config(**values) for name, values in stored["configs"].items()}
-    except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
+            names = [stored[name] for name in ("environment", "policy", "preset")]
+            names += [stored.get(name) for name in ("normalization", "weights")]
+            if not all(name is None or isinstance(name, str) for name in names):
+                raise TypeError("a name in it is no text")
+            configs = {name: L1Config(**values) for name, values in stored["configs"].items()}
+            _ = configs[stored["preset"]]
+            return stored, configs
+    except (
+        AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError
+    ) as error:  # fmt: skip
         raise ValueError(f"{file} is damaged ({error!r}): robustify the policy again") from error
     raise ValueError(
         f"{file} has the format {stored['format']!r}, and this version reads {_FORMAT}: robustify "
@@ -253,11 +261,9 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
 
 
 def _check_runs_nothing(folder: Path, stored: dict[str, Any]) -> None:
-    named = [stored["environment"], stored["policy"]]
-    data = ("torchscript", "onnx", "gymnasium", "dm_control")
-    for source in named:
-        kind = str(source or "").partition(":")[0]
-        if ":" in str(source or "") and kind not in data:
+    for what, data in (("environment", ()), ("policy", ("torchscript", "onnx"))):
+        source = str(stored[what] or "")
+        if ":" in source and source.partition(":")[0] not in data:
             raise ValueError(
                 f"{folder} names {source!r}, which would be run: say --trust if the folder is yours"
             )

@@ -343,6 +343,8 @@ def fit_dynamics(
         dynamics = make_dynamics(n, m, **{"hidden": (128, 128), **settings}).to(here)
         optimizer = torch.optim.Adam(dynamics.parameters(), lr=config.learning_rate)
         fit_to_transitions(dynamics, transitions, config, optimizer, on_epoch)
+    if not bool(dynamics.residuals.measured):
+        raise ValueError("the fit diverged: look at learning_rate and at the scale of the data")
     dynamics.quality = measure_quality(dynamics, transitions, names, units)
     if dynamics.quality.warning:
         warnings.warn(dynamics.quality.warning, stacklevel=2)
@@ -377,7 +379,9 @@ def fit_to_transitions(
     )
     if config.elites is not None:
         dynamics.set_elites(best_loss.topk(config.elites, largest=False).indices)
-    dynamics.residuals.measure(one_step_residuals(dynamics, validation))
+    residual = one_step_residuals(dynamics, validation)
+    if bool(residual.isfinite().all()):  # else the loss tells that the fit diverged
+        dynamics.residuals.measure(residual)
     return replace(report, dropped=transitions.dropped)
 
 

@@ -26,7 +26,7 @@ from torchrl_l1.dynamics import calibrate_filter
 from torchrl_l1.dynamics.fit import one_step_residuals
 from torchrl_l1.envs import DISTURBANCES, Perturbation
 from torchrl_l1.experiment.checkpoints import KEPT, kept_by, load_state
-from torchrl_l1.experiment.errors import RunDirectoryError, message
+from torchrl_l1.experiment.errors import RunDirectoryError, fitting_into_memory, message
 from torchrl_l1.experiment.l1_options import (
     closest_option,
     l1_option,
@@ -104,7 +104,8 @@ def load_run(path: str | Path, *, last: bool = False) -> TrainedRun:
     here: dict[str, Any] = {"device": "cpu"}
     if hasattr(recipe, "compile_plans"):
         here["compile_plans"] = False  # as "auto" decides on the CPU
-    algorithm = replace(recipe, **here).build()
+    with fitting_into_memory(str(path)):
+        algorithm = replace(recipe, **here).build()
     state = checkpoint["algorithm"]
     load_state(algorithm, {**state, "buffer": {}}, directory.checkpoint_file)
     _measure_residuals(algorithm, state.get("buffer", {}), recipe)

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from torchrl_l1.algorithms import Algorithm
 from torchrl_l1.algorithms.algorithm import Diverged, IterationResult
 from torchrl_l1.experiment.checkpoints import checkpoint_of, keep_checkpoints, load_state
-from torchrl_l1.experiment.errors import RunDirectoryError
+from torchrl_l1.experiment.errors import RunDirectoryError, fitting_into_memory
 from torchrl_l1.experiment.files import refuse_link, write_atomically
 from torchrl_l1.experiment.run_directory import RunDirectory, read_config, versions
 from torchrl_l1.experiment.settings import RunSettings, check_known, schema_of
@@ -53,7 +53,8 @@ def run(config: DictConfig) -> Path:
         disable=None,
     )
     with progress:
-        algorithm = recipe.build()
+        with fitting_into_memory(recipe.recipe):
+            algorithm = recipe.build()
         algorithm.on_phase = lambda phase: progress.set_postfix_str(phase)
         directory = RunDirectory(recipe.run_dir)
         for folder in ("wandb", "tensorboard", "checkpoints"):

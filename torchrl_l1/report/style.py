@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from torchrl_l1.algorithms.collection import ORACLE
+from torchrl_l1.atomic import write_through
 from torchrl_l1.report.identity import BASELINE
 
 # Labels hold values from files: what stands between dollars is no formula.
@@ -179,6 +180,8 @@ def legend_below(figure: Figure, axes: Sequence[Axes], last: Sequence[str] = ())
 
 def save(figure: Figure, file: Path) -> Path:
     """Write a figure and close it."""
-    figure.savefig(file, dpi=130)
+    write_through(
+        file, lambda buffer: figure.savefig(buffer, format=file.suffix[1:] or "png", dpi=130)
+    )
     plt.close(figure)
     return file
