@@ -372,8 +372,7 @@ def fit_to_transitions(
     # Once for all batches: the statistics stay as they are.
     inputs = dynamics.normalize_inputs(train["observation"], train["action"])
     target = dynamics.change_normalizer.normalize(change)
-    loss = EnsembleDynamicsLoss(dynamics)
-    validate = partial(evaluate_members, loss, validation)
+    validate = partial(evaluate_members, EnsembleDynamicsLoss(dynamics), validation)
     best_loss, report = train_members(
         dynamics, inputs, target, validate, config, optimizer, on_epoch
     )
