@@ -25,7 +25,7 @@ from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import FitConfig, calibrate_filter, make_dynamics
 from torchrl_l1.dynamics.network import model_precision
-from torchrl_l1.envs import Perturbation, get_task
+from torchrl_l1.envs import AnyTask, Perturbation, get_task
 
 DEVICES = ("cpu", "cuda", "auto")
 """Where models may be fitted and trajectories imagined."""
@@ -122,7 +122,7 @@ class Algorithm(ABC):
     steps there will be, and says what acts (:attr:`policies`).
 
     Args:
-        task: name of a task, see :data:`torchrl_l1.envs.TASKS`.
+        task: a task, or its name, see :func:`torchrl_l1.envs.get_task`.
         config: settings.
         l1: the adaptive controller of real environments; ``None`` for none.
         perturbation: noise and disturbances of the real environments.
@@ -156,7 +156,7 @@ class Algorithm(ABC):
 
     def __init__(
         self,
-        task: str,
+        task: str | AnyTask,
         config: AlgorithmConfig,
         l1: L1Config | None = None,
         perturbation: Perturbation | None = None,

@@ -14,7 +14,7 @@ from torchrl_l1.checks import (
 )
 from torchrl_l1.dynamics import HEADS, MODEL_FORMS, EnsembleDynamics
 from torchrl_l1.dynamics.ensemble import ACTIVATIONS
-from torchrl_l1.envs import Task
+from torchrl_l1.envs import AnyTask
 from torchrl_l1.planning import TrajectorySampler, check_sampling, resolve_compilation
 
 
@@ -29,7 +29,7 @@ class PlanSettings(Protocol):
 
 
 def make_sampler(
-    settings: PlanSettings, dynamics: EnsembleDynamics, task: Task, **more: Any
+    settings: PlanSettings, dynamics: EnsembleDynamics, task: AnyTask, **more: Any
 ) -> TrajectorySampler:
     """What values plans on a task, as an algorithm's settings say.
 

@@ -14,8 +14,8 @@ from torchrl.envs import Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_l1.algorithms.collection import seed_streams, stream_seed
-from torchrl_l1.deployment.environments import EnvironmentSource
 from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.envs import EnvironmentSource
 
 FEW_OBSERVATIONS = 5
 """Below this width of the observation, the paper's rule of thumb allows few switches."""

@@ -20,7 +20,8 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase
 
-from torchrl_l1.deployment.environments import load_attribute, require
+from torchrl_l1.envs import load_attribute
+from torchrl_l1.envs.references import require
 from torchrl_l1.experiment.evaluate import load_run
 
 Policy: TypeAlias = str | TensorDictModuleBase | nn.Module | Callable[[Tensor], Any]
@@ -192,7 +193,7 @@ def load_policy(
     Args:
         policy: a source or an object.
         env: the environment that it is for, see
-            :func:`~torchrl_l1.deployment.environments.vector_environment`.
+            :func:`~torchrl_l1.envs.vector_environment`.
         normalization: file of the statistics of VecNormalize, a pickle, or ``"none"``.
         weights: file of a state dict to load into the module; pickles are refused in it.
 

@@ -19,6 +19,7 @@ from hydra.errors import CompactHydraException, HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_l1.envs.references import folders_of
 from torchrl_l1.experiment.errors import USER_ERRORS, RecipeError, message
 from torchrl_l1.experiment.files import problem, yaml_text
 from torchrl_l1.experiment.recipes import (
@@ -38,7 +39,7 @@ _HYDRA_SETTINGS = [
     "hydra.sweep.subdir=.",
     "hydra/job_logging=disabled",
     "hydra/hydra_logging=disabled",
-    "hydra.job.config.override_dirname.exclude_keys=[seed,run_dir,resume,wandb.mode]",
+    "hydra.job.config.override_dirname.exclude_keys=[seed,run_dir,resume,wandb.mode,search_path]",
 ]
 
 _FLAGS_WITH_VALUE = (
@@ -71,7 +72,10 @@ def launch(name: str, arguments: Sequence[str]) -> None:
     register()
     flags, overrides = split_flags([text for text in arguments if text != "--trust"])
     if not any(flag.partition("=")[0] in _OWN_WAYS for flag in flags):
-        _check(recipe, overrides, "-m" in flags or "--multirun" in flags, "--trust" in arguments)
+        config = _check(
+            recipe, overrides, "-m" in flags or "--multirun" in flags, "--trust" in arguments
+        )
+        overrides += _search_path_override(recipe, config, overrides)
     before = sys.argv
     sys.argv = ["torchrl-l1", *flags, *_search_path(recipe), *_HYDRA_SETTINGS, *overrides]
     try:
@@ -98,8 +102,8 @@ class _WithoutOverrides:
         return getattr(self._stream, name)
 
 
-def _check(recipe: Path, overrides: Sequence[str], sweeps: bool, trusted: bool) -> None:
-    """Compose the first run and refuse what Hydra would tell at length, or not at all."""
+def _check(recipe: Path, overrides: Sequence[str], sweeps: bool, trusted: bool) -> DictConfig:
+    """Compose the first run, and refuse what Hydra would tell at length, or not at all."""
     if not trusted:
         check_data(recipe)
     settings = [*_search_path(recipe), *_HYDRA_SETTINGS]
@@ -122,6 +126,7 @@ def _check(recipe: Path, overrides: Sequence[str], sweeps: bool, trusted: bool) 
     except (yaml.YAMLError, RecursionError, OverflowError, TypeError) as error:
         raise RecipeError(f"{recipe}, or what it includes: {problem(error)}") from error
     check_known(config)
+    return config
 
 
 @contextmanager
@@ -226,7 +231,33 @@ def compose(name: str, overrides: Sequence[str] = (), *, trusted: bool = False) 
     if not trusted:
         check_data(recipe)
     with _composing(recipe.parent):
-        return hydra.compose(recipe.stem, [*_search_path(recipe), *overrides])
+        config = hydra.compose(recipe.stem, [*_search_path(recipe), *overrides])
+    if "search_path" in config and not config.search_path:
+        config.search_path = _folders_of_code(recipe, config, overrides)
+    return config
+
+
+# Keys that may name code of the user's.
+_NAMING = ("task", "reward", "termination")
+
+
+def _search_path_override(recipe: Path, config: DictConfig, overrides: Sequence[str]) -> list[str]:
+    """The folders of what a recipe names, told to every process that runs a part of it."""
+    if config.get("search_path"):
+        return []
+    folders = _folders_of_code(recipe, config, overrides)
+    quoted = ",".join("'" + folder.replace("'", "\\'") + "'" for folder in folders)
+    return [f"search_path=[{quoted}]"] if folders else []
+
+
+def _folders_of_code(recipe: Path, config: DictConfig, overrides: Sequence[str]) -> list[str]:
+    """Folders with modules and files that settings name: that of the recipe, or where we are."""
+    given = [text.partition("=") for text in overrides]
+    names = [name for key, _, value in given if key in _NAMING for name in value.split(",")]
+    values = (OmegaConf.select(config, key) for key in _NAMING)
+    names += [str(value) for value in values if value is not None]
+    own = [] if recipe.is_relative_to(recipes_dir()) else [recipe.parent]
+    return folders_of(names, [*own, Path.cwd()])
 
 
 def _search_path(recipe: Path) -> list[str]:
