@@ -49,7 +49,7 @@ def test_snippet_runs(page: str, snippet: str) -> None:
     assert env.rollout(3)["next", "l1", "u_exec"].shape[-1] == 1
 
 
-@pytest.mark.parametrize("page", ["docs/tasks.md", "docs/disturbances.md"])
+@pytest.mark.parametrize("page", ["docs/tasks.md", "docs/disturbances.md", "docs/environments.md"])
 def test_snippets_of_a_page_run_in_turn(page: str) -> None:
     snippets = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
     names: dict[str, object] = {}

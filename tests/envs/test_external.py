@@ -237,7 +237,7 @@ def test_environments_of_torchrl():
 def test_batches_and_missing_vectors_of_torchrl_are_refused():
     with pytest.raises(ValueError, match="is a batch"):
         task_of(lambda: GymEnv("Pendulum-v1", num_envs=2))
-    with pytest.raises(ValueError, match="as actions|continuous"):
+    with pytest.raises(ValueError, match=r"as actions|continuous"):
         task_of(lambda: TransformedEnv(GymEnv("CartPole-v1"), StepCounter()))
     with pytest.raises(ValueError):
         task_of(PendulumEnv)  # its observations are single numbers beside parameters

@@ -263,6 +263,9 @@ NEWER = {"fit.precision": "float32", "precision": "float32"} | {
 }
 NEWER |= {
     "on_divergence": "stop",
+    "reward": "builtin",
+    "termination": "builtin",
+    "outcome_model": {"members": 3, "hidden": [128, 128], "activation": "silu"},
     "l1.estimator": "least_squares",
     "l1.filter": "low_pass",
     "l1.covariance": "residuals",

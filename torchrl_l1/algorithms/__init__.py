@@ -11,6 +11,7 @@ from torchrl_l1.algorithms.mbmf_config import (
 )
 from torchrl_l1.algorithms.metrpo import METRPO
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig, PolicyConfig
+from torchrl_l1.algorithms.outcomes import OutcomeConfig, Outcomes
 from torchrl_l1.algorithms.pets import PETS
 from torchrl_l1.algorithms.pets_config import PETSConfig
 from torchrl_l1.envs import Perturbation
@@ -26,6 +27,8 @@ __all__ = [
     "MBMFConfig",
     "METRPOConfig",
     "ModelConfig",
+    "OutcomeConfig",
+    "Outcomes",
     "PETSConfig",
     "Perturbation",
     "PolicyConfig",

@@ -35,7 +35,6 @@ from torchrl_l1.algorithms.config import episode_length, make_sampler
 from torchrl_l1.algorithms.facts import AlgorithmFacts, Phase
 from torchrl_l1.algorithms.fine_tuning import FINE_TUNING_METRICS, FineTuning, exploring
 from torchrl_l1.algorithms.mbmf_config import STAGES, MBMFConfig
-from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.policy import GaussianPolicy, acting
 from torchrl_l1.control import L1Config
 from torchrl_l1.envs import AnyTask, Perturbation, action_bounds
@@ -120,7 +119,7 @@ class MBMF(Algorithm):
         )
         collected *= self.episode_steps
         capacity = self.start.frames + collected
-        self.learning = ModelLearning(self.dynamics, config.fit, config.label, capacity)
+        self.learning = self.make_learning(capacity)
         low, high = action_bounds(self.task)
         half = (high - low) / 2
         self.cloning = Cloning(self.clone, config.cloning, half, collected)
@@ -233,7 +232,9 @@ class MBMF(Algorithm):
 
     def _planner(self, shooting: ShootingConfig) -> ModelPredictiveController:
         config = self.config
-        sampler = make_sampler(config, self.dynamics, self.task, discount=config.plan_discount)
+        sampler = make_sampler(
+            config, self.dynamics, self.task, self.outcomes, discount=config.plan_discount
+        )
         return ModelPredictiveController(
             sampler, shooting, *self._bounds(), replan_every=config.replan_every
         )

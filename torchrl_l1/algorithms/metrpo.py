@@ -24,7 +24,6 @@ from torchrl_l1.algorithms.algorithm import (
 from torchrl_l1.algorithms.collection import L1_METRICS, policy_returns, signal_metrics
 from torchrl_l1.algorithms.facts import AlgorithmFacts, Phase, Stage
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig, check_clipping
-from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.policy import GaussianPolicy, acting
 from torchrl_l1.algorithms.policy_improvement import (
     POLICY_METRICS,
@@ -93,14 +92,16 @@ class METRPO(Algorithm):
         super().__init__(task, config, l1, perturbation, **surroundings)
         n, m = self.task.observation_dim, self.task.action_dim
         self.policy = GaussianPolicy(n, m, config.policy.hidden, config.policy.std).to(self.device)
-        self.improvement = PolicyImprovement(self.task, self.dynamics, self.policy, config)
+        self.improvement = PolicyImprovement(
+            self.task, self.dynamics, self.policy, config, self.outcomes
+        )
         on_cpu = self.device.type == "cpu"
         self.acting_policy = self.policy if on_cpu else deepcopy(self.policy).cpu()
         real = partial(self.real, policy=acting(self.acting_policy, self.task, config.clip_actions))
         self.collection = real(episodes=config.episodes_per_iteration, horizon=self.episode_steps)
         self.evaluation = real(episodes=config.evaluation_episodes, horizon=self.horizon)
         capacity = (config.outer_iterations + 1) * self.collection.frames
-        self.learning = ModelLearning(self.dynamics, config.fit, config.label, capacity)
+        self.learning = self.make_learning(capacity)
 
     def iterate(self) -> Iterator[IterationResult]:
         """Run the outer iterations that are left, reporting after each."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
@@ -14,6 +15,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig
+from torchrl_l1.algorithms.outcomes import Outcomes
 from torchrl_l1.algorithms.policy import GaussianPolicy, make_actor
 from torchrl_l1.dynamics import EnsembleDynamics, imagine
 from torchrl_l1.envs import AnyTask, StartStates, Task, action_bounds
@@ -82,10 +84,11 @@ class PolicyImprovement:
     """TRPO steps of a policy in a learned model (arXiv 1802.10592).
 
     Args:
-        task: rewards, start states and action bounds.
+        task: start states and action bounds.
         dynamics: the model.
         policy: changed in place, on the model's device.
         config: settings.
+        outcomes: rewards and ends of what is imagined.
     """
 
     def __init__(
@@ -94,8 +97,10 @@ class PolicyImprovement:
         dynamics: EnsembleDynamics,
         policy: GaussianPolicy,
         config: METRPOConfig,
+        outcomes: Outcomes,
     ) -> None:
         self.task, self.dynamics, self.policy, self.config = task, dynamics, policy, config
+        self.outcomes = outcomes
         self.device = next(policy.parameters()).device
         self.baseline = LinearFeatureBaseline(task.observation_dim).to(self.device)
         self.start_states = StartStates(task) if isinstance(task, Task) else SeenStarts()
@@ -112,12 +117,12 @@ class PolicyImprovement:
         trajectories = imagine(
             self.dynamics,
             self.policy.sampler(),
-            self.task.imagined_reward,
+            self.outcomes.reward,
             self.starts(config.imagined_steps // config.imagined_horizon, buffer),
             config.imagined_horizon,
             self.action_low,
             self.action_high,
-            self.task.terminated if config.imagined_termination else None,
+            self.outcomes.terminated(self._own_termination()),
             precision=config.precision,  # type: ignore[arg-type]
         )
         observation, step = trajectories["observation"], trajectories["step"]
@@ -142,6 +147,10 @@ class PolicyImprovement:
             imagined_return=rewards.sum(1).mean().item(),
             left_box=trajectories["next", "left_box"].any(1).float().mean().item(),
         )
+
+    def _own_termination(self) -> Callable[[Tensor], Tensor] | None:
+        own = self.config.imagined_termination and self.outcomes.own_termination
+        return self.task.terminated if own else None
 
     def _improve(self, observation: Tensor, action: Tensor, advantage: Tensor) -> TRPOReport:
         policy, config = self.policy, self.config.trpo

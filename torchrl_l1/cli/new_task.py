@@ -22,7 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest="source",
         required=True,
         metavar="ENV",
-        help="gymnasium/ID, PACKAGE:ID, dm_control/DOMAIN/TASK, MODULE:FUNCTION or FILE.py:FUNCTION",
+        help="gymnasium/ID, PACKAGE:ID, dm_control/DOMAIN/TASK, MODULE:FUNCTION or "
+        "FILE.py:FUNCTION",
     )
     add("--algorithm", choices=ALGORITHMS, default=ALGORITHMS[0], help="what shall learn")
     add("--dt", type=float, help="seconds of a step, where the environment does not tell")

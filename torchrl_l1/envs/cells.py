@@ -144,8 +144,8 @@ class TorchRLCell:
     def __init__(self, env: EnvBase, name: str, keys: Sequence[str]) -> None:
         if tuple(env.batch_size) not in ((), (1,)):
             raise ValueError(
-                f"{name} is a batch of {tuple(env.batch_size)} environments; let it return a single "
-                "one, which is made as often as it is needed"
+                f"{name} is a batch of {tuple(env.batch_size)} environments; let it return a "
+                "single one, which is made as often as it is needed"
             )
         parts = vectors(env)
         if not keys and "observation" in parts:

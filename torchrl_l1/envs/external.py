@@ -95,9 +95,9 @@ class ExternalTask:
             made = gymnasium.make(self.source.gymnasium_id, disable_env_checker=True, **options)
             return GymnasiumCell(made, self.name, self._keys)
         env = self.source.build()
-        if type(env) in (GymEnv, GymWrapper) and isinstance(env._env, gymnasium.Env):
-            if getattr(env, "wrapper_frame_skip", 1) == 1:
-                return GymnasiumCell(env._env, self.name, self._keys)
+        plain = type(env) in (GymEnv, GymWrapper) and getattr(env, "wrapper_frame_skip", 1) == 1
+        if plain and isinstance(env._env, gymnasium.Env):
+            return GymnasiumCell(env._env, self.name, self._keys)
         return TorchRLCell(env, self.name, self._keys)
 
     @property
@@ -127,10 +127,17 @@ class ExternalTask:
         if self.outcome is None:
             none = ", none" if what == "termination" else ""
             raise ValueError(
-                f"there is no built-in {what} for {self.name} to imagine with: say "
-                f"{what}=learned{none} or {what}=MODULE:FUNCTION ({PAGE})"
+                f"{what}: there is no built-in one for {self.name}; say {what}=learned{none} or "
+                f"{what}=MODULE:FUNCTION ({PAGE})"
             )
         return self.outcome
+
+    def sample_starts(self, count: int) -> Tensor:
+        """First observations of so many episodes ``(count, n)``, seeded by torch's generator."""
+        env = self.environment(1)
+        starts = [env.reset()["observation"] for _ in range(count)]
+        env.close()
+        return torch.cat(starts)
 
     def check_disturbances(self, names: Sequence[str]) -> None:
         """Refuse changes of a plant that cannot be reached.

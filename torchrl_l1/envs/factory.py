@@ -108,8 +108,8 @@ def make_env(
     the gain scales. The rollout's ``"action"`` is what the policy wrote.
 
     Args:
-        task: a key of :data:`~torchrl_l1.envs.TASKS`, any other name that :func:`get_task` takes, or
-            a task itself.
+        task: a key of :data:`~torchrl_l1.envs.TASKS`, any other name that :func:`get_task` takes,
+            or a task itself.
         num_envs: number of environments.
         action_noise: half-width of :class:`~torchrl_l1.envs.ActionNoise`.
         observation_noise: half-width of :class:`~torchrl_l1.envs.ObservationNoise`.

@@ -65,8 +65,8 @@ def check_tested(names: Iterable[str]) -> None:
 def filter_gain(settings: L1Settings, task: str | AnyTask) -> float:
     """Gain per step of the low-pass filter, however it was given.
 
-    Of an environment of elsewhere that is only named, it is the cutoff in rad/s where that was given:
-    nothing is run to learn the time of a step.
+    Of an environment of elsewhere that is only named, it is the cutoff in rad/s where that was
+    given: nothing is run to learn the time of a step.
 
     Raises:
         KeyError: for an unknown task, whose time step a ``cutoff`` needs.

@@ -19,11 +19,13 @@ from torchrl_l1.algorithms import (
     Algorithm,
     MBMFConfig,
     METRPOConfig,
+    OutcomeConfig,
     Perturbation,
     PETSConfig,
 )
 from torchrl_l1.algorithms.algorithm import DEVICES
 from torchrl_l1.algorithms.metrpo_config import check_clipping
+from torchrl_l1.algorithms.outcomes import check_outcome
 from torchrl_l1.checks import check_choice, check_count, check_optional_count, check_positive
 from torchrl_l1.compilation import check_mode
 from torchrl_l1.control import L1Config
@@ -111,6 +113,11 @@ class RunSettings(ABC):
         threads: CPU threads of torch.
         device: ``cpu``, ``cuda`` or ``auto`` (CUDA where there is one).
         horizon: steps per real episode; the task's own if null.
+        reward: of imagined trajectories: ``builtin``, the task's own; ``learned``, by a model that
+            is fitted with the dynamics; or ``MODULE:FUNCTION`` or ``FILE.py:FUNCTION``.
+        termination: of imagined trajectories, likewise, or ``none``. Where it is ``builtin``,
+            METRPO goes by ``imagined_termination``.
+        outcome_model: see :class:`~torchrl_l1.algorithms.OutcomeConfig`.
         on_divergence: ``stop`` or ``warn`` where losses, weights or plans are no longer finite.
         l1: see :class:`L1Settings`.
         perturbation: noise and disturbances of the real environment.
@@ -130,6 +137,9 @@ class RunSettings(ABC):
     threads: int = 1
     device: str = "cpu"
     horizon: int | None = None
+    reward: str = "builtin"
+    termination: str = "builtin"
+    outcome_model: OutcomeConfig = field(default_factory=OutcomeConfig)
     on_divergence: str = "stop"
     l1: L1Settings = field(default_factory=L1Settings)
     perturbation: Perturbation = field(default_factory=Perturbation)
@@ -159,6 +169,8 @@ class RunSettings(ABC):
         if self.dt is not None:
             check_positive("dt", self.dt)
         check_choice("on_divergence", self.on_divergence, ("stop", "warn"))
+        check_outcome("reward", self.reward)
+        check_outcome("termination", self.termination)
 
     @abstractmethod
     def collected_episodes(self, iterations: int) -> int:
@@ -199,6 +211,10 @@ class RunSettings(ABC):
             horizon=self.horizon,
             device=self.device,
             compile_l1=check_mode(self.l1.compile, "l1.compile"),
+            reward=self.reward,
+            termination=self.termination,
+            outcome_model=self.outcome_model,
+            search_path=self.search_path,
         )
         algorithm.stops_on_divergence = self.on_divergence == "stop"
         return algorithm

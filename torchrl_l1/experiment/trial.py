@@ -148,8 +148,8 @@ def _about_seeds(
         return Finding("the same seed gives the same episodes")
     return Finding(
         "the same seed does not give the same episodes",
-        "draw what is random in the environment from the generator that reset(seed=...) seeds, or a "
-        "resumed run will differ from an unbroken one",
+        "draw what is random in the environment from the generator that reset(seed=...) seeds, or "
+        "a resumed run will differ from an unbroken one",
     )
 
 
@@ -294,13 +294,15 @@ def _about_model(data: TensorDictBase, recipe: RunSettings) -> Iterator[Finding]
 
 def reward_function(algorithm: Algorithm) -> Any:
     """The reward of imagination; ``None`` where it is learned."""
-    return algorithm.task.imagined_reward
+    learned = "reward_model" in algorithm.outcomes.models
+    return None if learned else algorithm.outcomes.reward
 
 
 def termination_function(algorithm: Algorithm) -> tuple[bool, Any]:
     """Whether the termination of imagination is known, and the function, if there is one."""
-    task = algorithm.task
-    return True, task.terminated if task.terminates else None
+    task, outcomes = algorithm.task, algorithm.outcomes
+    builtin = task.terminated if outcomes.own_termination and task.terminates else None
+    return not outcomes.learns_terminations, outcomes.terminated(builtin)
 
 
 def failures(findings: Sequence[Finding]) -> int:
