@@ -18,7 +18,7 @@ from torchrl_l1.dynamics import (
     fit_termination,
 )
 
-FIT = FitConfig(batch_size=200, max_epochs=60, patience=20)
+FIT = FitConfig(learning_rate=5e-3, batch_size=200, max_gradient_steps=300)
 
 
 def transitions(count: int = 2400, seed: int = 0) -> TensorDict:
@@ -118,29 +118,28 @@ def test_a_separable_termination_is_learned_though_it_is_rare() -> None:
     model = TerminationModel(3, hidden=(32,))
     report = fit_termination(model, data[:5000], data[5000:], FIT, fused(model))
     assert report.terminal == pytest.approx(share, abs=0.01)
-    assert report.missed < 0.1 and report.false_alarms < 0.005
+    assert report.missed < 0.15 and report.false_alarms < 0.005
     fresh = transitions(4000, seed=1)["next"]
     wrong = model(fresh["observation"]) != fresh["terminated"][:, 0]
     assert wrong.float().mean() < 0.005
     assert model(fresh["observation"].reshape(40, 100, 3)).shape == (40, 100)
 
 
-def test_the_weight_of_rare_ends_is_taken_out_of_the_prediction() -> None:
-    """Where an end is a matter of chance, the log-odds are those of the chance."""
+def test_ends_that_are_a_matter_of_chance_come_as_often_as_in_the_data() -> None:
     torch.manual_seed(0)
-    count, chance = 20_000, 0.05
+    count, chance = 4000, 0.05
     data = TensorDict(batch_size=[count])
     data["next"] = {
         "observation": torch.randn(count, 1),
         "terminated": torch.rand(count, 1) < chance,
     }
+    train = data[:3600]
     model = TerminationModel(1, hidden=(8,))
-    fit_termination(model, data[:18_000], data[18_000:], FIT, fused(model))
-    assert model.head.weight.item() == pytest.approx((1 - chance) / chance, rel=0.1)
-    with torch.no_grad():
-        logit = model.logit(torch.zeros(1, 1))
-    assert logit.sigmoid().item() == pytest.approx(chance, abs=0.015)
-    assert not model(data["next", "observation"]).any()
+    report = fit_termination(model, train, data[3600:], FIT, fused(model))
+    ended = train["next", "terminated"].sum().item()
+    assert report.terminal == pytest.approx(ended / 3600)
+    assert model.head.weight.item() == pytest.approx((3600 - ended) / ended)
+    assert model(train["next", "observation"]).sum().item() == ended
 
 
 def test_where_no_end_was_seen_none_is_predicted() -> None:
@@ -149,7 +148,7 @@ def test_where_no_end_was_seen_none_is_predicted() -> None:
     model = TerminationModel(3, hidden=(8,))
     optimizer = fused(model)
     fit_termination(model, data[:500], data[500:], FIT, optimizer)
-    assert model.seen
+    assert model.threshold.isfinite()
     data["next", "terminated"] = torch.zeros(600, 1, dtype=torch.bool)
     weights = [weight.clone() for weight in model.network.weights]
     report = fit_termination(model, data[:500], data[500:], FIT, optimizer)

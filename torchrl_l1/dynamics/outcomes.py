@@ -133,9 +133,9 @@ class TerminationModel(OutcomeModel):
     """A learned termination: whether an episode is over in a next observation.
 
     Terminal states are rare. In a fit, errors on them count as much more as there are fewer of
-    them, and the prediction takes that out of the logit again (arXiv 2007.07314 calls it logit
-    adjustment), so that a state is called terminal where it more likely is than not. Where no
-    terminal state has been seen, none is predicted.
+    them, and afterwards the threshold is put where as many of the training data's states lie
+    above it as are terminal: imagination then ends episodes as often as the data do, however
+    sharp the networks are by then. Where no terminal state has been seen, none is predicted.
 
     Args:
         observation_dim: number of observations, n.
@@ -145,7 +145,7 @@ class TerminationModel(OutcomeModel):
         std_floor: smallest standard deviation of the normaliser, raw units.
 
     Attributes:
-        seen: whether there was a terminal state among the training data, ``()``, bool.
+        threshold: log-odds above which a state is terminal, ``()``; infinite before one is seen.
 
     Examples:
         >>> model = TerminationModel(3, hidden=(16,))
@@ -153,7 +153,7 @@ class TerminationModel(OutcomeModel):
         tensor(False)
     """
 
-    seen: Tensor
+    threshold: Tensor
     head: BernoulliHead
 
     def __init__(
@@ -166,15 +166,11 @@ class TerminationModel(OutcomeModel):
     ) -> None:
         head = BernoulliHead()
         super().__init__(observation_dim, head, members, hidden, activation, std_floor)
-        self.register_buffer("seen", torch.zeros((), dtype=torch.bool))
-
-    def logit(self, next_observation: Tensor) -> Tensor:
-        """Log-odds of a termination in next observations ``(..., n)``: ``(...)``."""
-        return self.member_mean(next_observation) - self.head.weight.log()
+        self.register_buffer("threshold", torch.full((), torch.inf))
 
     def forward(self, next_observation: Tensor) -> Tensor:
         """Whether episodes end in next observations ``(..., n)``: ``(...)``, bool."""
-        return (self.logit(next_observation) > 0) & self.seen
+        return self.member_mean(next_observation) > self.threshold
 
 
 @dataclass
@@ -275,12 +271,14 @@ def fit_termination(
     rows = [_column(model, part, "observation") for part in (train, validation)]
     ends = [_column(model, part, "terminated") for part in (train, validation)]
     share = ends[0].mean().item()
-    model.seen.fill_(share > 0)
+    model.threshold.fill_(torch.inf)
     fit = FitReport(0.0, 0.0, 0, 0)
     if share > 0:
         weight = (1 - share) / share
         model.head.weight.fill_(min(max(weight, 1 / _MOST_WEIGHT), _MOST_WEIGHT))
         fit = _fit(model, rows, ends, config, optimizer)
+        with torch.no_grad():
+            model.threshold.copy_(_threshold(model.member_mean(rows[0]), int(ends[0].sum())))
     with torch.no_grad():
         called, ended = model(rows[1]), ends[1][:, 0] > 0
     missed, alarms = (~called)[ended], called[~ended]
@@ -310,6 +308,12 @@ def _fit(
         return torch.cat(losses, -1).mean(-1)
 
     return train_members(model, inputs, targets[0], validate, config, optimizer)[1]
+
+
+def _threshold(values: Tensor, count: int) -> Tensor:
+    """What so many of the values lie above: the middle between two of them."""
+    padded = torch.cat([values.sort(descending=True).values, values.new_full((1,), -torch.inf)])
+    return padded[count - 1 : count + 1].mean()
 
 
 def _transitions(model: RewardModel, data: TensorDictBase, action_key: NestedKey) -> Tensor:
