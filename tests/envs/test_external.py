@@ -7,7 +7,7 @@ import torch
 from gymnasium.spaces import Box, Dict, Discrete
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torchrl.envs import GymEnv, PendulumEnv, StepCounter, TransformedEnv
+from torchrl.envs import GymEnv, StepCounter, TransformedEnv
 
 from torchrl_l1.control import time_step
 from torchrl_l1.envs import ExternalTask, Task, environment_source, get_task, make_env
@@ -239,8 +239,6 @@ def test_batches_and_missing_vectors_of_torchrl_are_refused():
         task_of(lambda: GymEnv("Pendulum-v1", num_envs=2))
     with pytest.raises(ValueError, match=r"as actions|continuous"):
         task_of(lambda: TransformedEnv(GymEnv("CartPole-v1"), StepCounter()))
-    with pytest.raises(ValueError):
-        task_of(PendulumEnv)  # its observations are single numbers beside parameters
 
 
 def test_plants_of_gymnasiums_mujoco_can_be_changed():

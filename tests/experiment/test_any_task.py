@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -123,8 +122,8 @@ def test_a_file_beside_the_recipe_is_found_from_everywhere(
 @pytest.mark.parametrize("launcher", ["basic", "joblib"])
 def test_sweeps_over_packages_functions_and_files(launcher: str, place: Path) -> None:
     """In a process of its own, whose path does not have the folder, and in the launcher's."""
-    if launcher == "joblib" and find_spec("hydra_plugins.hydra_joblib_launcher") is None:
-        pytest.skip("the joblib launcher is not installed")
+    if launcher == "joblib":
+        pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     tasks = ",".join(NAMES)
     more = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"] if launcher == "joblib" else []
     apart(["run", "pets/any", "-m", f"task={tasks}", "reward=rafts:reward", *TINY, *more], place)

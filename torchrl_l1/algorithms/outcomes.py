@@ -154,8 +154,6 @@ class Outcomes:
         self.reward: Callable[[Tensor, Tensor, Tensor], Tensor]
         self._termination: Termination | None = None
         self.own_termination = termination == "builtin"
-        if self.own_termination:
-            _ = task.terminates  # an environment of elsewhere may not tell
         with self._stream("initialisation"):
             if reward == "learned":
                 model = RewardModel(n, m, **networks, std_floor=std_floor, margin=margin)
@@ -165,6 +163,8 @@ class Outcomes:
             else:
                 found = _transitions(task, self.device)
                 self.reward = _function("reward", reward, found, search_path)
+            if self.own_termination:
+                _ = task.terminates  # an environment of elsewhere may not tell
             if termination == "learned":
                 ends = TerminationModel(n, **networks, std_floor=std_floor).to(self.device)
                 self._termination = self.models["termination_model"] = ends

@@ -246,9 +246,10 @@ def _ant(env: Any) -> Outcome | None:
     def fallen(following: Tensor) -> Tensor:
         return ~healthy(following)
 
+    if not note:
+        note = "the forward speed is that of the torso a substep before"
     if env._contact_cost_weight:
-        unseen = "what the ground is pressed with costs something and is not observed"
-        note = f"{note}, and {unseen}" if note else unseen
+        note += ", and what the ground is pressed with costs something and is not observed"
     return Outcome(reward, fallen if env._terminate_when_unhealthy else never, note)
 
 
