@@ -147,3 +147,12 @@ def test_known_rewards_are_those_of_imagination() -> None:
     assert sampler.reward(x, x[:, :1], x).tolist() == [1.0, 0.0]
     assert sampler.terminated(x).tolist() == [False, True]
     assert task.horizon == 1000
+
+
+def test_robust_l1_acts_within_bounds_of_each_entry() -> None:
+    robust = L1Config.robust(0.1, action_low=LOW, action_high=HIGH)
+    task = ExternalTask(environment_source(Raft), horizon=12)
+    algorithm = PETS(task, CONFIGS[PETS], robust, reward="learned", termination="none")
+    (first, *_) = algorithm.iterate()
+    assert math.isfinite(first.metrics["l1/u_a"])
+    assert bool(algorithm.dynamics.residuals.calibrated)

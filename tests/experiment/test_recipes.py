@@ -41,7 +41,8 @@ RUN_DIR = "run_dir=unused"
 
 
 def composed(name: str, *overrides: str) -> RunSettings:
-    recipe = OmegaConf.to_object(compose(name, [RUN_DIR, *overrides]))
+    task = ["task=gymnasium/Pendulum-v1"] if name.endswith("/any") else []
+    recipe = OmegaConf.to_object(compose(name, [RUN_DIR, *task, *overrides]))
     assert isinstance(recipe, RunSettings)
     return recipe
 
@@ -263,6 +264,9 @@ NEWER = {"fit.precision": "float32", "precision": "float32"} | {
 }
 NEWER |= {
     "on_divergence": "stop",
+    "dt": None,
+    "observation_keys": [],
+    "search_path": [],
     "reward": "builtin",
     "termination": "builtin",
     "outcome_model": {"members": 3, "hidden": [128, 128], "activation": "silu"},

@@ -63,7 +63,7 @@ class ExternalTask:
     ) -> None:
         self.source, self.name = source, source.name or "the environment"
         self._keys = tuple(observation_keys)
-        cell = self.cell()
+        cell = self._cell()
         try:
             self.observation_dim = cell.observation_dim
             self.action_dim = len(cell.low)
@@ -84,7 +84,7 @@ class ExternalTask:
             raise ValueError(f"{self.name} does not tell {what}: give {key}={unit} ({PAGE})")
         return given if told is None else told
 
-    def cell(self, limited: bool = True) -> Cell:
+    def _cell(self, limited: bool = True) -> Cell:
         """One environment, by itself.
 
         Args:
@@ -210,7 +210,7 @@ class ExternalEnv(EnvBase):
         super().__init__(device="cpu", batch_size=[num_envs])
         self.task, self.num_envs, self.max_steps, self._dtype = task, num_envs, max_steps, dtype
         task.check_disturbances(list(plant or {}))
-        self.cells = [task.cell(limited=False) for _ in range(num_envs)]
+        self.cells = [task._cell(limited=False) for _ in range(num_envs)]
         for cell in self.cells:
             if plant:
                 simulation = cell.simulation()
