@@ -155,4 +155,6 @@ def test_robust_l1_acts_within_bounds_of_each_entry() -> None:
     algorithm = PETS(task, CONFIGS[PETS], robust, reward="learned", termination="none")
     (first, *_) = algorithm.iterate()
     assert math.isfinite(first.metrics["l1/u_a"])
-    assert bool(algorithm.dynamics.residuals.calibrated)
+    executed = algorithm.learning.buffer[:]["executed"]
+    assert bool((executed >= torch.tensor(LOW) - 1e-6).all())
+    assert bool((executed <= torch.tensor(HIGH) + 1e-6).all())
