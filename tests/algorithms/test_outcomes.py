@@ -263,12 +263,12 @@ def test_a_function_that_will_not_do_is_refused_in_one_line(
 
 @pytest.mark.parametrize(
     "setting",
-    ["reward=learnt", "reward=none", "termination=off", "reward=own.py", "termination=a:b c"],
+    ["reward=learnt", "reward=none", "termination=off", "reward=own.py", "termination=a:1"],
 )
 def test_other_words_are_refused(setting: str, tiny_recipe: Callable[..., DictConfig]) -> None:
     name = setting.partition("=")[0]
     with pytest.raises(ValueError, match=rf"{name} must be builtin, learned, .*MODULE:FUNCTION"):
-        run(tiny_recipe(setting if " " not in setting else f"'{setting}'"))
+        run(tiny_recipe(setting))
     with pytest.raises(ValueError, match="no module 'nowhere'"):
         run(tiny_recipe(f"{name}=nowhere:function"))
 
