@@ -107,7 +107,9 @@ class GymnasiumCell:
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
         """See :class:`Cell`."""
         observation, reward, terminated, truncated, _ = self.env.step(action.astype(self._type))
-        return self._observed(observation), float(reward), bool(terminated), bool(truncated)
+        # Some give an array with one number.
+        earned = np.asarray(reward, dtype=np.float64).item()
+        return self._observed(observation), earned, bool(terminated), bool(truncated)
 
     def time_step(self) -> float | None:
         """See :class:`Cell`."""
