@@ -154,7 +154,7 @@ def help_texts() -> dict[str, str]:
             main([*arguments, "--help"])
         return out.getvalue()
 
-    commands = re.findall(r"^    (\w+)(?:  .*)?$", text(), re.MULTILINE)
+    commands = re.findall(r"^    ([\w-]+)(?:  .*)?$", text(), re.MULTILINE)
     return {command: text(command) for command in commands}
 
 
@@ -233,7 +233,7 @@ def test_mbmf_page_names_every_recipe_and_stage() -> None:
     assert tuple(stages.split()) == MBMF.facts.stage_names
     (listed,) = re.findall(r"one for each of the five tasks: (.*?)\.", page)
     assert {f"mbmf/{name}" for name in words(listed)} == {
-        name for name in available_recipes() if name.startswith("mbmf/")
+        name for name in available_recipes() if name.startswith("mbmf/") and name != "mbmf/any"
     }
 
 

@@ -90,6 +90,8 @@ PAGES = {
     "docs/quickstart.md": Page(check=augmented("augmented")),
     "docs/tasks.md": Page(),
     "docs/disturbances.md": Page(),
+    "docs/environments.md": Page(),
+    "docs/learned_rewards.md": Page(),
     "docs/l1.md": Page(
         given=L1_GIVEN,
         check=check_l1,

@@ -42,7 +42,8 @@ RUN_DIR = "run_dir=unused"
 
 
 def composed(name: str, *overrides: str) -> RunSettings:
-    recipe = OmegaConf.to_object(compose(name, [RUN_DIR, *overrides]))
+    task = ["task=gymnasium/Pendulum-v1"] if name.endswith("/any") else []
+    recipe = OmegaConf.to_object(compose(name, [RUN_DIR, *task, *overrides]))
     assert isinstance(recipe, RunSettings)
     return recipe
 
@@ -331,6 +332,9 @@ NEWER |= {
     "checkpoint": {"every": None, "best": False},
     **dict.fromkeys(("wandb.entity", "wandb.group", "wandb.name", "wandb.notes")),
     "wandb.tags": [],
+    "dt": None,
+    "observation_keys": [],
+    "search_path": [],
     "reward": "builtin",
     "termination": "builtin",
     "outcome_model": {"members": 3, "hidden": [128, 128], "activation": "silu"},

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -26,7 +26,7 @@ from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import FitConfig, calibrate_filter, make_dynamics
 from torchrl_l1.dynamics.network import model_precision
-from torchrl_l1.envs import Perturbation, get_task
+from torchrl_l1.envs import AnyTask, Perturbation, get_task
 
 DEVICES = ("cpu", "cuda", "auto")
 """Where models may be fitted and trajectories imagined."""
@@ -122,6 +122,7 @@ class Surroundings(TypedDict, total=False):
     reward: str
     termination: str
     outcome_model: OutcomeConfig | None
+    search_path: Sequence[str]
 
 
 class Algorithm(ABC):
@@ -132,7 +133,7 @@ class Algorithm(ABC):
     steps there will be, and says what acts (:attr:`policies`).
 
     Args:
-        task: name of a task, see :data:`torchrl_l1.envs.TASKS`.
+        task: a task, or its name, see :func:`torchrl_l1.envs.get_task`.
         config: settings.
         l1: the adaptive controller of real environments; ``None`` for none.
         perturbation: noise and disturbances of the real environments.
@@ -147,6 +148,7 @@ class Algorithm(ABC):
         reward: of imagined trajectories, see :class:`~torchrl_l1.algorithms.Outcomes`.
         termination: likewise.
         outcome_model: of a learned reward and a learned termination.
+        search_path: folders for files and modules that reward and termination name.
 
     Attributes:
         facts: what is known of the algorithm without running it.
@@ -170,7 +172,7 @@ class Algorithm(ABC):
 
     def __init__(
         self,
-        task: str,
+        task: str | AnyTask,
         config: AlgorithmConfig,
         l1: L1Config | None = None,
         perturbation: Perturbation | None = None,
@@ -183,6 +185,7 @@ class Algorithm(ABC):
         reward: str = "builtin",
         termination: str = "builtin",
         outcome_model: OutcomeConfig | None = None,
+        search_path: Sequence[str] = (),
     ) -> None:
         self.config, self.l1, self.seed = config, l1, seed
         self.device = resolve_device(device)
@@ -210,6 +213,7 @@ class Algorithm(ABC):
             margin=config.model.box_margin,
             seed=seed,
             device=self.device,
+            search_path=search_path,
         )
         on_cpu = self.device.type == "cpu"
         self.acting_dynamics = self.dynamics if on_cpu else deepcopy(self.dynamics).cpu()

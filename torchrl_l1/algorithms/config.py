@@ -15,7 +15,7 @@ from torchrl_l1.checks import (
 )
 from torchrl_l1.dynamics import HEADS, MODEL_FORMS, EnsembleDynamics
 from torchrl_l1.dynamics.ensemble import ACTIVATIONS
-from torchrl_l1.envs import Task
+from torchrl_l1.envs import AnyTask
 from torchrl_l1.planning import TrajectorySampler, check_sampling, resolve_compilation
 
 
@@ -32,7 +32,7 @@ class PlanSettings(Protocol):
 def make_sampler(
     settings: PlanSettings,
     dynamics: EnsembleDynamics,
-    task: Task,
+    task: AnyTask,
     outcomes: Outcomes,
     **more: Any,
 ) -> TrajectorySampler:
@@ -48,7 +48,9 @@ def make_sampler(
     return TrajectorySampler(
         dynamics,
         outcomes.reward,
-        outcomes.terminated(task.terminated if task.terminates else None),
+        outcomes.terminated(
+            task.terminated if outcomes.own_termination and task.terminates else None
+        ),
         settings.particles,
         settings.propagation,  # type: ignore[arg-type]
         settings.precision,  # type: ignore[arg-type]

@@ -32,14 +32,14 @@ from torchrl_l1.algorithms.policy_improvement import (
 )
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics.network import model_precision
-from torchrl_l1.envs import Perturbation
+from torchrl_l1.envs import AnyTask, Perturbation
 
 
 class METRPO(Algorithm):
     """The algorithm and its state; :meth:`iterate` is the loop.
 
     Args:
-        task: name of a task, see :data:`torchrl_l1.envs.TASKS`.
+        task: a task, or its name, see :func:`torchrl_l1.envs.get_task`.
         config: settings.
         l1: the adaptive controller used in collection; ``None`` for none.
         perturbation: noise and disturbances of the real environments.
@@ -82,7 +82,7 @@ class METRPO(Algorithm):
 
     def __init__(
         self,
-        task: str,
+        task: str | AnyTask,
         config: METRPOConfig,
         l1: L1Config | None = None,
         perturbation: Perturbation | None = None,
@@ -109,7 +109,9 @@ class METRPO(Algorithm):
         for iteration in self.rounds():
             if len(self.learning.buffer) == 0:
                 with self.phase("random"):
-                    self.learning.store(self.collection.random(self.seed))
+                    data = self.collection.random(self.seed)
+                    self.learning.store(data)
+                    self.improvement.see(data)
 
             fit = self.fit()
 
@@ -133,6 +135,7 @@ class METRPO(Algorithm):
                 self.acting_policy.load_state_dict(self.policy.state_dict())
                 data = self.collection.collect(self.seed, iteration)
                 self.learning.store(data)
+                self.improvement.see(data)
 
             with self.phase("evaluate"):
                 returns = policy_returns(

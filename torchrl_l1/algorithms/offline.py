@@ -46,7 +46,7 @@ from torchrl_l1.algorithms.policy_improvement import (
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import read_transitions
 from torchrl_l1.dynamics.network import model_precision
-from torchrl_l1.envs import Perturbation
+from torchrl_l1.envs import AnyTask, Perturbation, action_bounds
 
 OFFLINE_METRICS: dict[str, str] = {
     "data/transitions": "Transitions of the dataset.",
@@ -65,8 +65,8 @@ class Offline(Algorithm):
     """The algorithm and its state; :meth:`iterate` is the loop.
 
     Args:
-        task: name of a task, see :data:`torchrl_l1.envs.TASKS`: its rewards and its bounds count,
-            and the real system that policies are measured on is of it.
+        task: a task, or its name, see :func:`torchrl_l1.envs.get_task`: its rewards and its bounds
+            count, and the real system that policies are measured on is of it.
         config: settings.
         l1: the adaptive controller used in measurements; ``None`` for none.
         perturbation: noise and disturbances of the real environments.
@@ -127,7 +127,7 @@ class Offline(Algorithm):
 
     def __init__(
         self,
-        task: str,
+        task: str | AnyTask,
         config: OfflineConfig,
         l1: L1Config | None = None,
         perturbation: Perturbation | None = None,
@@ -144,11 +144,7 @@ class Offline(Algorithm):
         self.data = data
         n, m = self.task.observation_dim, self.task.action_dim
         self.policy = GaussianPolicy(n, m, config.policy.hidden, config.policy.std).to(self.device)
-        bounds = (
-            torch.full((m,), bound, device=self.device)
-            for bound in (self.task.action_low, self.task.action_high)
-        )
-        self.pessimism = Pessimism(self.dynamics, config, *bounds)
+        self.pessimism = Pessimism(self.dynamics, config, *action_bounds(self.task, self.device))
         self.improvement = PolicyImprovement(
             self.task, self.dynamics, self.policy, config, self.outcomes, self.pessimism
         )
@@ -282,8 +278,8 @@ class Offline(Algorithm):
                 self.policy.normalizer.fit(data["observation"].to(self.device))
             if not config.enabled:
                 return {"clone/validation_loss": 0.0}
-            half_range = (self.task.action_high - self.task.action_low) / 2
-            cloning = Cloning(self.policy, config, half_range, len(data))
+            low, high = action_bounds(self.task)
+            cloning = Cloning(self.policy, config, (high - low) / 2, len(data))
             cloning.store(data["observation"], data["action"])
             report = cloning.fit(lambda epoch: self.on_phase(f"cloning, epoch {epoch}"))
             self._check_weights("policy", self.policy)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -24,7 +24,7 @@ from torchrl_l1.dynamics import (
 )
 from torchrl_l1.dynamics.ensemble import ACTIVATIONS
 from torchrl_l1.dynamics.transitions import split_validation
-from torchrl_l1.envs import StartStates, Task, load_attribute
+from torchrl_l1.envs import AnyTask, ExternalTask, StartStates, Task, action_bounds, load_attribute
 
 REWARDS = ("builtin", "learned")
 """The words of ``reward``; anything else is a function."""
@@ -111,8 +111,10 @@ class Outcomes:
         margin: how far a learned reward may lie beyond those of the data, fraction of their range.
         seed: of the run.
         device: of the models.
+        search_path: folders for files and modules that are named.
 
     Attributes:
+        own_termination: whether imagined trajectories end as the task does.
         reward: maps observations ``(..., n)``, actions ``(..., m)`` and next observations to
             ``(...)``.
         models: those that are learned, by their names.
@@ -123,7 +125,7 @@ class Outcomes:
 
     def __init__(
         self,
-        task: Task,
+        task: AnyTask,
         reward: str = "builtin",
         termination: str = "builtin",
         config: OutcomeConfig | None = None,
@@ -133,6 +135,7 @@ class Outcomes:
         margin: float = 0.5,
         seed: int = 0,
         device: torch.device | str = "cpu",
+        search_path: Sequence[str] = (),
     ) -> None:
         check_outcome("reward", reward)
         check_outcome("termination", termination)
@@ -148,21 +151,26 @@ class Outcomes:
         self.models: dict[str, RewardModel | TerminationModel] = {}
         n, m = task.observation_dim, task.action_dim
         networks = vars(config or OutcomeConfig())
-        self.reward: Callable[[Tensor, Tensor, Tensor], Tensor] = task.imagined_reward
+        self.reward: Callable[[Tensor, Tensor, Tensor], Tensor]
         self._termination: Termination | None = None
-        self._own_termination = termination == "builtin"
+        self.own_termination = termination == "builtin"
         with self._stream("initialisation"):
             if reward == "learned":
                 model = RewardModel(n, m, **networks, std_floor=std_floor, margin=margin)
                 self.reward = self.models["reward_model"] = model.to(self.device)
-            elif reward != "builtin":
-                self.reward = _function("reward", reward, _transitions(task, self.device))
+            elif reward == "builtin":
+                self.reward = task.imagined_reward
+            else:
+                found = _transitions(task, self.device)
+                self.reward = _function("reward", reward, found, search_path)
+            if self.own_termination:
+                _ = task.terminates  # an environment of elsewhere may not tell
             if termination == "learned":
                 ends = TerminationModel(n, **networks, std_floor=std_floor).to(self.device)
                 self._termination = self.models["termination_model"] = ends
             elif termination not in TERMINATIONS:
                 states = _transitions(task, self.device)[2:]
-                self._termination = _function("termination", termination, states)
+                self._termination = _function("termination", termination, states, search_path)
         self.optimizers = {
             name: torch.optim.Adam(model.parameters(), lr=self.fit_config.learning_rate, fused=True)
             for name, model in self.models.items()
@@ -179,7 +187,7 @@ class Outcomes:
         Args:
             builtin: what the algorithm takes of its task, if it is to.
         """
-        return builtin if self._own_termination else self._termination
+        return builtin if self.own_termination else self._termination
 
     def fit(self, buffer: ReplayBuffer, action_key: str, iteration: int) -> dict[str, float]:
         """Fit what is learned to all data, from the weights that it has; returns its metrics.
@@ -248,22 +256,27 @@ def _finite(data: TensorDictBase, *keys: NestedKey) -> Tensor:
     return torch.stack([data[key].isfinite().flatten(1).all(1) for key in keys]).all(0)
 
 
-def _transitions(task: Task, device: torch.device) -> list[Tensor]:
+def _transitions(task: AnyTask, device: torch.device) -> list[Tensor]:
     """Observations, actions and next observations of batch size ``[4, 2]`` to try functions on."""
-    start = StartStates(task)(16).to(device)
+    assert isinstance(task, (Task, ExternalTask))
+    sample = StartStates(task) if isinstance(task, Task) else task.sample_starts
+    start = sample(16).to(device)
     share = torch.rand(8, task.action_dim)
-    action = task.action_low + (task.action_high - task.action_low) * share
+    low, high = action_bounds(task)
+    action = low + (high - low) * share
     return [part.unflatten(0, (4, 2)) for part in (start[:8], action.to(device), start[8:])]
 
 
-def _function(name: str, value: str, transitions: list[Tensor]) -> Callable[..., Tensor]:
+def _function(
+    name: str, value: str, transitions: list[Tensor], search_path: Sequence[str] = ()
+) -> Callable[..., Tensor]:
     """A user's function, which must be batched torch and give numbers of the right kind.
 
     Raises:
         ValueError: in one line, naming the setting.
     """
     try:
-        function = load_attribute(value)
+        function = load_attribute(value, search_path)
     # A file may fail in any way.
     except Exception as error:
         why = " ".join(str(error).split())[:200]

@@ -27,7 +27,7 @@ from torchrl_l1.algorithms.config import episode_length, make_sampler
 from torchrl_l1.algorithms.facts import AlgorithmFacts, Phase, Stage, Variant
 from torchrl_l1.algorithms.pets_config import PETSConfig
 from torchrl_l1.control import L1Config
-from torchrl_l1.envs import Perturbation
+from torchrl_l1.envs import AnyTask, Perturbation
 from torchrl_l1.planning import ModelPredictiveController
 
 
@@ -35,7 +35,7 @@ class PETS(Algorithm):
     """The algorithm and its state; :meth:`iterate` is the loop.
 
     Args:
-        task: name of a task, see :data:`torchrl_l1.envs.TASKS`.
+        task: a task, or its name, see :func:`torchrl_l1.envs.get_task`.
         config: settings.
         l1: the adaptive controller used in collection; ``None`` for none.
         perturbation: noise and disturbances of the real environments.
@@ -71,7 +71,7 @@ class PETS(Algorithm):
 
     def __init__(
         self,
-        task: str,
+        task: str | AnyTask,
         config: PETSConfig,
         l1: L1Config | None = None,
         perturbation: Perturbation | None = None,

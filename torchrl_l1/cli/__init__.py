@@ -15,7 +15,18 @@ DESCRIPTION = "Robust model-based reinforcement learning with L1 adaptive contro
 _TRUST = "let the file set up Hydra itself, which may run any code"
 
 
-_DEPLOYMENT = (
+_LATER = (
+    (
+        "new-task",
+        "write a recipe for an environment of yours",
+        "Reads what an environment tells and writes a commented recipe for it.",
+    ),
+    (
+        "check",
+        "try a recipe's environment for a minute, and say what to fix",
+        "Specs, seeds, the effect of actions, reward and termination functions against the "
+        "environment, and one fit of the model.",
+    ),
     (
         "robustify",
         "put L1 around a policy of any origin, and test it under disturbances",
@@ -51,11 +62,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     _run_parser(commands)
     _campaign_parser(commands)
     _evaluate_parser(commands, asked="evaluate" in arguments[:1])
-    for name, words, description in _DEPLOYMENT:
+    for name, words, description in _LATER:
         parts = commands.add_parser(name, help=words, description=description)
         # What their options come with is heavy; no other command should wait for it.
         if name in arguments[:1]:
-            import_module(f"torchrl_l1.cli.{name}").add_arguments(parts)
+            import_module(f"torchrl_l1.cli.{_module(name)}").add_arguments(parts)
     _report_parser(commands)
     verify = commands.add_parser(
         "verify", help="replay recorded traces of a reference controller in float64"
@@ -85,6 +96,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         _dispatch(options, rest)
 
 
+def _module(command: str) -> str:
+    return command.replace("-", "_")
+
+
 def _dispatch(options: argparse.Namespace, rest: list[str]) -> None:
     from torchrl_l1.experiment.errors import USER_ERRORS, message
 
@@ -99,9 +114,9 @@ def _dispatch(options: argparse.Namespace, rest: list[str]) -> None:
             from torchrl_l1.cli.evaluate import evaluate_command
 
             evaluate_command(options)
-        elif options.command in [name for name, *_ in _DEPLOYMENT]:
-            chosen = import_module(f"torchrl_l1.cli.{options.command}")
-            getattr(chosen, f"{options.command}_command")(options)
+        elif options.command in [name for name, *_ in _LATER]:
+            name = _module(options.command)
+            getattr(import_module(f"torchrl_l1.cli.{name}"), f"{name}_command")(options)
         elif options.command == "report":
             from torchrl_l1.report.build import report_command
 

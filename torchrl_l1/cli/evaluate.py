@@ -12,7 +12,7 @@ import numpy as np
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from torchrl_l1.envs import DISTURBANCES
+from torchrl_l1.envs import DISTURBANCES, Task
 from torchrl_l1.envs.rendering import (
     RenderingUnavailable,
     animation,
@@ -118,6 +118,12 @@ def write_filmstrip(
         what has been written.
     """
     task = trained.algorithm.task
+    if not isinstance(task, Task):
+        print(
+            f"No filmstrip: poses are drawn of tasks of ours, not of {task.name}; torchrl-l1 play "
+            f"{trained.path} --output film.gif shows an episode"
+        )
+        return
     several = len({cell.stage for cell in cells}) > 1
     steps = min(trained.recipe.horizon or task.horizon, round(_SECONDS_SHOWN / task.dt))
     try:
@@ -161,6 +167,7 @@ def _check_one_study(runs: Sequence[TrainedRun]) -> None:
             trained.recipe,
             seed=0,
             run_dir="",
+            search_path=[],
             resume=False,
             wandb=WandbSettings(),
             on_divergence="stop",

@@ -22,10 +22,10 @@ from torchrl_l1.atomic import write_atomically
 from torchrl_l1.checks import check_choice, check_count
 from torchrl_l1.control import ActionJacobian, L1Config, L1State, L1Transform, augment, init
 from torchrl_l1.deployment.assessment import run_episodes
-from torchrl_l1.deployment.environments import require
 from torchrl_l1.deployment.policies import FunctionPolicy
 from torchrl_l1.deployment.robust_controller import RobustController
 from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.envs.references import require
 
 FORMATS = {".pt": "torchscript", ".ts": "torchscript", ".onnx": "onnx", ".pt2": "export"}
 """What a file holds, by its suffix."""

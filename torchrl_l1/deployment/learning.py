@@ -16,8 +16,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.utils import get_primers_from_module
 
 from torchrl_l1.algorithms.collection import seed_streams, stream_seed
-from torchrl_l1.deployment.environments import EnvironmentSource
 from torchrl_l1.dynamics import EnsembleDynamics, read_transitions
+from torchrl_l1.envs import EnvironmentSource
 
 FEW_OBSERVATIONS = 5
 """Below this width of the observation, the paper's rule of thumb allows few switches."""

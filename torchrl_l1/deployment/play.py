@@ -23,10 +23,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_l1.algorithms.collection import seed_streams, stream_seed
 from torchrl_l1.atomic import write_atomically, write_through
 from torchrl_l1.control import L1Transform
-from torchrl_l1.deployment.environments import require, simulation_of
 from torchrl_l1.deployment.learning import policy_transforms
 from torchrl_l1.deployment.robust_controller import RobustController
+from torchrl_l1.envs.references import require
 from torchrl_l1.envs.rendering import draw_poses, rollout_frames, write_gif
+from torchrl_l1.envs.sources import simulation_of
 from torchrl_l1.experiment.l1_options import OFF
 
 SUFFIXES = (".mp4", ".gif")

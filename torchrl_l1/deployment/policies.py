@@ -22,8 +22,8 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, TensorDictPrimer
 from torchrl.modules.utils import get_primers_from_module
 
-from torchrl_l1.deployment.environments import require
 from torchrl_l1.envs import load_attribute
+from torchrl_l1.envs.references import require
 from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
 
@@ -243,7 +243,7 @@ def load_policy(
     Args:
         policy: a source or an object.
         env: the environment that it is for, see
-            :func:`~torchrl_l1.deployment.environments.vector_environment`.
+            :func:`~torchrl_l1.envs.vector_environment`.
         normalization: file of the statistics of VecNormalize, a pickle, or ``"none"``.
         weights: file of a state dict to load into the module; pickles are refused in it.
 

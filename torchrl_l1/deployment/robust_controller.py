@@ -22,12 +22,6 @@ from torchrl_l1.checks import check_choice, check_count, check_not_negative, che
 from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.control.layout import Layout
 from torchrl_l1.deployment.assessment import Assessment, Disturbances, assess
-from torchrl_l1.deployment.environments import (
-    EnvironmentSource,
-    MakeEnv,
-    environment_source,
-    vector_environment,
-)
 from torchrl_l1.deployment.learning import (
     collect,
     epsilon_for,
@@ -37,6 +31,8 @@ from torchrl_l1.deployment.learning import (
 )
 from torchrl_l1.deployment.policies import Policy, load_policy
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, calibrate_filter, fit_dynamics
+from torchrl_l1.envs import EnvironmentSource, environment_source, vector_environment
+from torchrl_l1.envs.sources import MakeEnv
 from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.files import read_text
@@ -450,7 +446,7 @@ def load_target(
 def _of_run(folder: Path) -> RobustController:
     """A training with its own model; with its own L1, where it has one of that kind."""
     run = load_run(folder)
-    own, task = run.recipe.l1, run.recipe.task
+    own, task = run.recipe.l1, run.algorithm.task
     configs = {}
     for name in reversed(PRESETS):
         settings = own
@@ -462,7 +458,9 @@ def _of_run(folder: Path) -> RobustController:
     policy = list(run.algorithm.policies.values())[-1]
     model = run.algorithm.acting_dynamics
     origin = {"policy": str(folder)}
-    return RobustController(environment_source(task), policy, model, configs, origin=origin)
+    source = environment_source(run.recipe.task, run.recipe.search_path)
+    source = replace(source, observation_keys=tuple(run.recipe.observation_keys))
+    return RobustController(source, policy, model, configs, origin=origin)
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw
 
 from torchrl_l1.atomic import write_through
 from torchrl_l1.envs.task import Task
-from torchrl_l1.envs.tasks import get_task
+from torchrl_l1.envs.tasks import built_in_task
 
 _WORKER = Path(__file__).with_name("_render_worker.py")
 _TIMEOUT_SECONDS = 300
@@ -77,7 +77,7 @@ def rollout_frames(
         ValueError: if ``qpos`` has the wrong shape.
         RenderingUnavailable: if no backend works; the message says what each of them reported.
     """
-    return draw_poses(_decorated(get_task(task)), qpos, size=size)
+    return draw_poses(_decorated(built_in_task(task)), qpos, size=size)
 
 
 def draw_poses(

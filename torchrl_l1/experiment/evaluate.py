@@ -24,7 +24,7 @@ from torchrl_l1.algorithms.policy import kinds_of
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import calibrate_filter
 from torchrl_l1.dynamics.fit import one_step_residuals
-from torchrl_l1.envs import DISTURBANCES, Perturbation
+from torchrl_l1.envs import DISTURBANCES, AnyTask, ExternalTask, Perturbation
 from torchrl_l1.experiment.checkpoints import KEPT, kept_by, load_state
 from torchrl_l1.experiment.errors import RunDirectoryError, fitting_into_memory, message
 from torchrl_l1.experiment.l1_options import (
@@ -32,7 +32,7 @@ from torchrl_l1.experiment.l1_options import (
     l1_option,
     same_controller,
 )
-from torchrl_l1.experiment.matrix import Condition
+from torchrl_l1.experiment.matrix import Condition, disturbed
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run_directory import RunDirectory, read_config
 from torchrl_l1.experiment.settings import L1Settings, RunSettings, l1_config, schema_of
@@ -194,6 +194,7 @@ def evaluate_episodes(
     Raises:
         ValueError: for a stage that the run has not, before anything is evaluated.
     """
+    check_plants(trained.algorithm.task, cells)
     for cell in [replace(cell, stage=trained.stage(cell.stage)) for cell in cells]:
         collection = make_collection(trained, cell, episodes)
         data = collection.evaluate(seed, deterministic=cell.policy == "deterministic")
@@ -219,6 +220,19 @@ def evaluate_episodes(
         )
 
 
+def check_plants(task: AnyTask, cells: Sequence[Condition]) -> None:
+    """Refuse changes of a plant that cannot be reached.
+
+    Raises:
+        ValueError: naming disturbance and environment.
+    """
+    if not isinstance(task, ExternalTask):
+        return
+    for cell in cells:
+        changed = disturbed(cell.disturbances)
+        task.check_disturbances([n for n in changed if DISTURBANCES[n].acts_on == "plant"])
+
+
 def episodes_file(table: Path) -> Path:
     """Where the rows of single episodes are that belong to a table in ``RUN_DIR/evaluations``."""
     return table.parent / "episodes" / table.name
@@ -234,7 +248,7 @@ def make_collection(trained: TrainedRun, cell: Condition, episodes: int) -> Coll
         episodes,
         trained.algorithm.policies[trained.stage(cell.stage)],
         trained.algorithm.acting_dynamics,
-        ORACLE if settings is None else l1_config(settings, trained.recipe.task),
+        ORACLE if settings is None else l1_config(settings, trained.algorithm.task),
         perturbation,
         trained.recipe.horizon,
     )
@@ -251,7 +265,7 @@ def _is_own(trained: TrainedRun, cell: Condition) -> bool:
     """Whether the controller of a test is the one that the run was trained with."""
     if cell.l1 == ORACLE:
         return False
-    return same_controller(_tested_l1(trained, cell), trained.recipe.l1, trained.recipe.task)
+    return same_controller(_tested_l1(trained, cell), trained.recipe.l1, trained.algorithm.task)
 
 
 def _tested_l1(trained: TrainedRun, cell: Condition) -> L1Settings:
@@ -262,7 +276,7 @@ def _tested_l1(trained: TrainedRun, cell: Condition) -> L1Settings:
     for either.
     """
     own = trained.recipe.l1
-    if cell.l1 == closest_option(own, trained.recipe.task):
+    if cell.l1 == closest_option(own, trained.algorithm.task):
         settings = own
     else:
         settings = replace(l1_option(cell.l1), epsilon=own.epsilon)

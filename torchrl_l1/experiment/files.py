@@ -51,6 +51,16 @@ def bounded(name: str, longest: int = LONGEST_NAME) -> str:
     return f"{kept}_{digest(name, _DIGEST)}"
 
 
+def path_text(text: str) -> str:
+    """A text as a part of a path: what separates folders becomes an underscore.
+
+    Examples:
+        >>> path_text("task=gymnasium/Reacher-v5")
+        'task=gymnasium_Reacher-v5'
+    """
+    return re.sub(r"[/\\:]", "_", text)
+
+
 def bounded_overrides(dirname: str) -> str:
     """Hydra's name for a list of overrides, with the shortest of them and a digest if it is long.
 
@@ -58,9 +68,12 @@ def bounded_overrides(dirname: str) -> str:
         >>> bounded_overrides("l1=off,noise=action")
         'l1=off,noise=action'
     """
+    parts = [
+        path_text(part) if part.startswith("task=") else part
+        for part in re.split(r",(?=[\w+~][\w.@/+~-]*=)", dirname)
+    ]
     if len(dirname.encode()) <= _LONGEST_OVERRIDES:
-        return dirname
-    parts = re.split(r",(?=[\w+~][\w.@/+~-]*=)", dirname)
+        return ",".join(parts)
     kept: set[int] = set()
     length = 0
     for index in sorted(range(len(parts)), key=lambda index: len(parts[index])):

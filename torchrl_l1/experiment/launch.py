@@ -21,6 +21,7 @@ from hydra.errors import CompactHydraException, HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_l1.envs.references import folders_of
 from torchrl_l1.experiment.errors import USER_ERRORS, RecipeError, message
 from torchrl_l1.experiment.files import bounded, problem, yaml_text
 from torchrl_l1.experiment.recipes import (
@@ -35,6 +36,7 @@ from torchrl_l1.experiment.settings import SCHEMAS, WandbSettings, check_known, 
 # What does not tell results apart, or is named in another way.
 _IN_NO_NAME = (
     *("seed", "run_dir", "resume", "recipe", "loggers", "checkpoint.every", "checkpoint.best"),
+    "search_path",
     *(f"wandb.{part.name}" for part in fields(WandbSettings)),
 )
 
@@ -81,7 +83,10 @@ def launch(name: str, arguments: Sequence[str]) -> None:
     register()
     flags, overrides = split_flags([text for text in arguments if text != "--trust"])
     if not any(flag.partition("=")[0] in _OWN_WAYS for flag in flags):
-        _check(recipe, overrides, "-m" in flags or "--multirun" in flags, "--trust" in arguments)
+        config = _check(
+            recipe, overrides, "-m" in flags or "--multirun" in flags, "--trust" in arguments
+        )
+        overrides += _search_path_override(recipe, config, overrides)
     before = sys.argv
     settings = [*_search_path(recipe), *_HYDRA_SETTINGS]
     sys.argv = ["torchrl-l1", *flags, *settings, *overrides, *_name(recipe, overrides)]
@@ -109,8 +114,8 @@ class _WithoutOverrides:
         return getattr(self._stream, name)
 
 
-def _check(recipe: Path, overrides: Sequence[str], sweeps: bool, trusted: bool) -> None:
-    """Compose the first run and refuse what Hydra would tell at length, or not at all."""
+def _check(recipe: Path, overrides: Sequence[str], sweeps: bool, trusted: bool) -> DictConfig:
+    """Compose the first run, and refuse what Hydra would tell at length, or not at all."""
     if not trusted:
         check_data(recipe)
     settings = [*_search_path(recipe), *_HYDRA_SETTINGS]
@@ -139,6 +144,7 @@ def _check(recipe: Path, overrides: Sequence[str], sweeps: bool, trusted: bool) 
                 f"{text}: only a sweeper such as hydra/sweeper=optuna chooses from an interval; "
                 "name values, or give that sweeper"
             )
+    return config
 
 
 @contextmanager
@@ -270,7 +276,10 @@ def compose(name: str, overrides: Sequence[str] = (), *, trusted: bool = False) 
         check_data(recipe)
     with _composing(recipe.parent):
         own = [*overrides, *_name(recipe, overrides)]
-        return hydra.compose(recipe.stem, [*_search_path(recipe), *own])
+        config = hydra.compose(recipe.stem, [*_search_path(recipe), *own])
+    if "search_path" in config and not config.search_path:
+        config.search_path = _folders_of_code(recipe, config, overrides)
+    return config
 
 
 def _name(recipe: Path, overrides: Sequence[str]) -> list[str]:
@@ -286,6 +295,29 @@ def _name(recipe: Path, overrides: Sequence[str]) -> list[str]:
     named = not isinstance(content, dict) or "recipe" in content
     stem = recipe.stem.replace("'", "\\'")
     return [] if named else [f"recipe='{stem}'"]
+
+
+# Keys that may name code of the user's.
+_NAMING = ("task", "reward", "termination")
+
+
+def _search_path_override(recipe: Path, config: DictConfig, overrides: Sequence[str]) -> list[str]:
+    """The folders of what a recipe names, told to every process that runs a part of it."""
+    if config.get("search_path"):
+        return []
+    folders = _folders_of_code(recipe, config, overrides)
+    quoted = ",".join("'" + folder.replace("'", "\\'") + "'" for folder in folders)
+    return [f"search_path=[{quoted}]"] if folders else []
+
+
+def _folders_of_code(recipe: Path, config: DictConfig, overrides: Sequence[str]) -> list[str]:
+    """Folders with modules and files that settings name: that of the recipe, or where we are."""
+    given = [text.partition("=") for text in overrides]
+    names = [name for key, _, value in given if key in _NAMING for name in value.split(",")]
+    values = (OmegaConf.select(config, key) for key in _NAMING)
+    names += [str(value) for value in values if value is not None]
+    own = [] if recipe.is_relative_to(recipes_dir()) else [recipe.parent]
+    return folders_of(names, [*own, Path.cwd()])
 
 
 def _search_path(recipe: Path) -> list[str]:

@@ -94,7 +94,8 @@ def title(task: str, noise: str | None = None) -> str:
         >>> title("half_cheetah", "action")
         'Half cheetah, action noise'
     """
-    name = task.replace("_", " ").capitalize()
+    # Names of environments of elsewhere stay as they are.
+    name = task if re.search(r"[/:]", task) else task.replace("_", " ").capitalize()
     return name if noise is None else f"{name}, {noise_words(noise)}"
 
 
