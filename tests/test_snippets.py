@@ -92,6 +92,12 @@ PAGES = {
     "docs/disturbances.md": Page(),
     "docs/environments.md": Page(),
     "docs/learned_rewards.md": Page(),
+    "docs/offline.md": Page(
+        smaller={
+            'make_env("inverted_pendulum", 20).rollout(100)': 'make_env("inverted_pendulum", 4).rollout(50)',
+            "evaluation_episodes=2": "evaluation_episodes=2, imagined_steps=500",
+        },
+    ),
     "docs/l1.md": Page(
         given=L1_GIVEN,
         check=check_l1,
