@@ -205,6 +205,10 @@ def draw(summary: Sequence[Row]) -> None:
                 axis.plot(biases, mean, style, marker="o", ms=3, color=color, label=l1)
                 axis.fill_between(biases, low, high, color=color, alpha=0.12, linewidth=0)
             axis.set_title(f"{task}, {quality} data", fontsize=9)
+            if not select(summary, task=task, quality=quality):
+                axis.text(0.5, 0.5, "not run", ha="center", transform=axis.transAxes)
+                axis.set_axis_off()
+                continue
             axis.spines[["top", "right"]].set_visible(False)
             axis.grid(alpha=0.3)
         line[0].set_ylabel("return")
