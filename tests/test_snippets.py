@@ -94,7 +94,7 @@ PAGES = {
     "docs/learned_rewards.md": Page(),
     "docs/offline.md": Page(
         smaller={
-            '_env("inverted_pendulum", 20).rollout(100)': '_env("inverted_pendulum", 4).rollout(50)',
+            '"inverted_pendulum", 20).rollout(100)': '"inverted_pendulum", 4).rollout(50)',
             "evaluation_episodes=2": "evaluation_episodes=2, imagined_steps=500",
         },
     ),

@@ -123,7 +123,7 @@ def write_filmstrip(
             f"No filmstrip: poses are drawn of tasks of ours, not of {task.name}; torchrl-l1 play "
             f"{trained.path} --output film.gif shows an episode"
         )
-        return
+        return []
     several = len({cell.stage for cell in cells}) > 1
     steps = min(trained.recipe.horizon or task.horizon, round(_SECONDS_SHOWN / task.dt))
     try:

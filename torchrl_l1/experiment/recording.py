@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_l1.algorithms.collection import Collection, episode_returns
-from torchrl_l1.envs import Perturbation, Task
+from torchrl_l1.envs import AnyTask, Perturbation
 from torchrl_l1.experiment.datasets import Episode, split_episodes
 from torchrl_l1.experiment.evaluate import TrainedRun
 
@@ -62,7 +62,7 @@ class NoisyPolicy(TensorDictModuleBase):
         noise: standard deviation, as a fraction of half the range of the action.
     """
 
-    def __init__(self, policy: TensorDictModuleBase, task: Task, noise: float) -> None:
+    def __init__(self, policy: TensorDictModuleBase, task: AnyTask, noise: float) -> None:
         super().__init__()
         self.policy = policy
         self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
