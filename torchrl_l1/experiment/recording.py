@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_l1.algorithms.collection import Collection, episode_returns
-from torchrl_l1.envs import AnyTask, Perturbation
+from torchrl_l1.envs import AnyTask, Perturbation, action_bounds
 from torchrl_l1.experiment.datasets import Episode, split_episodes
 from torchrl_l1.experiment.evaluate import TrainedRun
 
@@ -66,8 +66,8 @@ class NoisyPolicy(TensorDictModuleBase):
         super().__init__()
         self.policy = policy
         self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
-        self.bounds = (task.action_low, task.action_high)
-        self.deviation = noise * (task.action_high - task.action_low) / 2
+        self.low, self.high = action_bounds(task)
+        self.deviation = noise * (self.high - self.low) / 2
         primer = getattr(policy, "make_tensordict_primer", None)
         if primer is not None:
             self.make_tensordict_primer = primer
@@ -77,7 +77,7 @@ class NoisyPolicy(TensorDictModuleBase):
         tensordict = self.policy(tensordict)
         action = tensordict.get("action")
         noisy = action + self.deviation * torch.randn_like(action)
-        return tensordict.set("action", noisy.clamp(*self.bounds))
+        return tensordict.set("action", noisy.clamp(self.low, self.high))
 
 
 def record(
