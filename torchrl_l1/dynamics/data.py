@@ -119,7 +119,7 @@ def read_npz(
         if isinstance(file, np.ndarray):
             raise ValueError("a single array; save several by name with numpy.savez")
         with file:
-            arrays = {name: file[name] for name in file.files}
+            arrays = {name: np.asarray(file[name]) for name in file.files}
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such file") from None
     except Exception as error:

@@ -71,7 +71,8 @@ def _load(path: Path) -> dict[str, dict[str, np.ndarray]]:
             prefix, separator, field = key.rpartition("/")
             if separator and prefix.count("/") == 1:
                 try:
-                    traces.setdefault(prefix, {})[field] = archive[key]
+                    # Of a part that is no array NumPy gives the bytes.
+                    traces.setdefault(prefix, {})[field] = np.asarray(archive[key])
                 except Exception as error:
                     raise ValueError(f"{path}: cannot read {key}: {error}") from error
         if not traces:
