@@ -16,10 +16,12 @@ from benchmarks import (
     jacobian,
     l1_controllers,
     l1_scaling,
+    l1_single,
     metrpo_iteration,
     planning,
     planning_precision,
     shooting,
+    startup,
     trpo,
 )
 from benchmarks.tables import Table
@@ -31,6 +33,7 @@ RESULTS = Path(__file__).parent / "results"
 BENCHMARKS: dict[str, tuple[int, int, Callable[[int], Table]]] = {
     "jacobian": (jacobian.THREADS, 21, jacobian.table),
     "l1_scaling": (l1_scaling.THREADS, 9, l1_scaling.table),
+    "l1_single": (l1_single.THREADS, 15, l1_single.table),
     "l1_controllers": (l1_controllers.THREADS, 15, l1_controllers.table),
     "env_stepping": (env_stepping.THREADS, 9, env_stepping.table),
     "collection": (collection.THREADS, 7, collection.table),
@@ -41,6 +44,7 @@ BENCHMARKS: dict[str, tuple[int, int, Callable[[int], Table]]] = {
     "imagination": (imagination.THREADS, 9, imagination.table),
     "trpo": (trpo.THREADS, 15, trpo.table),
     "metrpo_iteration": (metrpo_iteration.THREADS, 5, metrpo_iteration.table),
+    "startup": (startup.THREADS, 5, startup.table),
 }
 
 

@@ -17,7 +17,7 @@ from torchrl_l1.algorithms.policy import GaussianPolicy, acting
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, fit_ensemble
-from torchrl_l1.envs import Perturbation, Task, get_task, make_env
+from torchrl_l1.envs import TASKS, Perturbation, Task, make_env
 
 SETTINGS = (("inverted_pendulum", 25, 1.0), ("half_cheetah", 6, 3.0), ("half_cheetah", 25, 3.0))
 """Task, number of environments, epsilon."""
@@ -88,7 +88,7 @@ def run(repetitions: int, threads: tuple[int, ...]) -> list[Row]:
     for threads_now in threads:
         torch.set_num_threads(threads_now)
         for name, num_envs, epsilon in SETTINGS:
-            task = get_task(name)
+            task = TASKS[name]
             for width in WIDTHS:
                 if (name, width) not in models:
                     models[name, width] = fitted_model(task, width, FIT)

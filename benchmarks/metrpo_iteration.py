@@ -34,15 +34,15 @@ class PinnedUnavailableError(RuntimeError):
 
 
 def pinned() -> Path:
-    """A folder with the package as it was at the pinned commit, which is made if need be.
+    """A folder with package and recipes of the pinned commit, which is made if need be.
 
     Raises:
         PinnedUnavailableError: with the remedy.
     """
-    folder = _ROOT / "build" / f"pinned-{PINNED}"
+    folder = _ROOT / "build" / f"previous-{PINNED}"
     if folder.exists():
         return folder
-    command = ["git", "-C", str(_ROOT), "archive", PINNED, "torchrl_l1"]
+    command = ["git", "-C", str(_ROOT), "archive", PINNED, "torchrl_l1", "recipes"]
     try:
         archive = subprocess.run(command, check=True, capture_output=True).stdout
     except (subprocess.CalledProcessError, OSError) as error:

@@ -30,7 +30,8 @@ PACKAGES = (
 # What a package documents beside its exports: by name, wherever in the package it stands.
 UNEXPORTED = {
     "experiment": (
-        *("RunSettings", "L1Settings", "WandbSettings", "METRPORecipe", "PETSRecipe", "MBMFRecipe"),
+        *("RunSettings", "L1Settings", "WandbSettings", "CheckpointSettings", "METRPORecipe"),
+        *("PETSRecipe", "MBMFRecipe", "final_return"),
         *("OfflineRecipe", "read_dataset", "write_dataset", "Episode", "record", "Recording"),
         *("SCHEMAS", "l1_config", "launch", "compose", "run", "RunDirectory", "RunDirectoryError"),
         *("RunDirectoryInUse", "versions", "Condition", "TrainedRun", "load_run", "conditions"),

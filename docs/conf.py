@@ -7,6 +7,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 
 import _pages
+import _tutorial
 from torchrl_l1._version import __version__
 
 project = "torchrl_l1"
@@ -44,6 +45,7 @@ nitpicky = True
 nitpick_ignore_regex = [(r"py:.*", r"(?!torchrl_l1\.).*|.*\._.*")]
 
 _pages.write(Path(__file__).parent / "_generated")
+_tutorial.write(Path(__file__).with_name("tutorial.py"), Path(__file__).parent / "_generated")
 
 
 def setup(app: Any) -> None:

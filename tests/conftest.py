@@ -50,6 +50,9 @@ if HAS_FORKS:
 class Process(Protocol):
     """What :class:`subprocess.Popen` and :class:`Forked` have in common."""
 
+    @property
+    def pid(self) -> int: ...
+
     def poll(self) -> int | None: ...
 
     def wait(self, timeout: float | None = None) -> int: ...
@@ -69,6 +72,11 @@ class Forked:
         )
         self._process.start()
 
+    @property
+    def pid(self) -> int:
+        assert self._process.pid is not None
+        return self._process.pid
+
     def poll(self) -> int | None:
         return self._process.exitcode
 
@@ -79,11 +87,10 @@ class Forked:
         return self._process.exitcode
 
     def kill(self) -> None:
-        assert self._process.pid is not None
-        os.kill(self._process.pid, signal.SIGKILL)
+        os.kill(self.pid, signal.SIGKILL)
 
 
-def _started_anew(arguments: Sequence[str], output: Path) -> subprocess.Popen[bytes]:
+def started_anew(arguments: Sequence[str], output: Path) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "torchrl_l1.cli", *arguments]
     with output.open("ab") as log:
         return subprocess.Popen(
@@ -105,7 +112,7 @@ def start_cli(tmp_path: Path) -> Callable[..., Process]:
     """
 
     def start(arguments: Sequence[str], output: Path | None = None, anew: bool = False) -> Process:
-        starter = Forked if HAS_FORKS and not anew else _started_anew
+        starter = Forked if HAS_FORKS and not anew else started_anew
         return starter(arguments, output or tmp_path / "output")
 
     return start

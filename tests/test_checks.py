@@ -15,6 +15,7 @@ from torchrl_l1.algorithms import (
     MBMFConfig,
     METRPOConfig,
     ModelConfig,
+    OutcomeConfig,
     PETSConfig,
 )
 from torchrl_l1.algorithms.mbmf_config import ClonedPolicyConfig
@@ -38,6 +39,7 @@ SETTINGS: dict[type, tuple[str, dict[str, Any]]] = {
     METRPOConfig: ("", {}),
     ModelConfig: ("model.", {}),
     MPPIConfig: ("mppi.", {}),
+    OutcomeConfig: ("outcome_model.", {}),
     PETSConfig: ("", {}),
     PolicyConfig: ("policy.", {}),
     ShootingConfig: ("shooting.", {}),

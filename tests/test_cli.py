@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from torchrl_l1 import __version__
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.launch import split_flags
 
@@ -96,6 +97,24 @@ def test_verify_exits_by_its_verdict(capsys: pytest.CaptureFixture[str]) -> None
         main(["verify", "bad.npz"])
     assert exit_info.value.code == 1
     assert "TOO LARGE" in capsys.readouterr().out
+
+
+def test_a_recipe_is_copied_to_be_edited(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["recipes", "--copy", "metrpo/inverted_pendulum", "mine.yaml"])
+    assert capsys.readouterr().out == "mine.yaml is yours: torchrl-l1 run mine.yaml\n"
+    main(["run", "mine.yaml", "seed=7", "--cfg", "job"])
+    assert "recipe: mine" in capsys.readouterr().out
+    assert "is there already" in refused(
+        ["recipes", "--copy", "metrpo/inverted_pendulum", "mine.yaml"], capsys
+    )
+    assert "NAME" in refused(["recipes", "--copy", "a", "b", "c"], capsys)
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_info:
+        main(["--version"])
+    assert exit_info.value.code == 0
+    assert capsys.readouterr().out == f"torchrl-l1 {__version__}\n"
 
 
 def test_unknown_command_and_option_are_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -37,6 +37,19 @@ def test_short_commands_load_nothing_heavy(code: str) -> None:
     assert loaded.splitlines()[-1] == "loaded"
 
 
+def test_files_are_locked_and_replaced_where_there_is_no_fcntl(tmp_path: Path) -> None:
+    """As on Windows: what needs it is not loaded when a run directory is."""
+    code = (
+        "import sys; sys.modules['fcntl'] = None\n"
+        "from pathlib import Path\n"
+        "import torchrl_l1.cli, torchrl_l1.experiment.run_directory\n"
+        "from torchrl_l1.experiment.files import write_atomically\n"
+        f"write_atomically(Path({str(tmp_path / 'file')!r}), 'text')\n"
+        f"print(Path({str(tmp_path / 'file')!r}).read_text())"
+    )
+    assert fresh(code).splitlines()[-1] == "text"
+
+
 def test_public_names_are_what_their_packages_export() -> None:
     tree = ast.parse(Path(torchrl_l1.__file__).read_text(encoding="utf-8"))
     blocks = (node for node in tree.body if isinstance(node, ast.If))

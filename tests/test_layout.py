@@ -10,7 +10,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "torchrl_l1"
 FILES = sorted(PACKAGE.rglob("*.py"))
-MOST_FILES, MOST_LINES = 151, 500
+MOST_FILES, MOST_LINES = 158, 500
 
 # Each may import from those before it.
 ORDER = (

@@ -3,8 +3,9 @@
     python docs/results/robust.py [FOLDER]
 
 Reads the tables that `torchrl-l1 evaluate` wrote into FOLDER/TASK/seed_N/bias and .../noise, if a
-FOLDER is given, and keeps their episodes in `robust/TASK.csv` beside this file. Writes from those
-`robust/TASK.md`, `robust/TASK.png`, `robust/overall.md` and `robust/harm.md`.
+FOLDER is given, and keeps their episodes in `robust/TASK.csv` beside this file, in place of those
+of the same policy. Writes from those `robust/TASK.md`, `robust/TASK.png`, `robust/overall.md` and
+`robust/harm.md`.
 """
 
 from __future__ import annotations
@@ -42,14 +43,17 @@ def read(file: Path) -> list[Row]:
 
 
 def gather(folder: Path, task: str) -> None:
-    """Keep the episodes of all seeds of a task in one file."""
+    """Keep the episodes of all seeds of a task in one file; seeds that are not new keep theirs."""
     rows = []
     for file in sorted(folder.glob(f"{task}/seed_*/*/episodes.csv")):
         rows += [{**row, "run": file.parts[-3]} for row in read(file)]
-    # Undisturbed episodes are those of the tests of biases.
-    if rows:
-        HERE.mkdir(exist_ok=True)
-        write_table(HERE / f"{task}.csv", rows)
+    if not rows:
+        return
+    HERE.mkdir(exist_ok=True)
+    kept = HERE / f"{task}.csv"
+    new = {row["run"] for row in rows}
+    old = [row for row in read(kept) if row["run"] not in new] if kept.exists() else []
+    write_table(kept, sorted(old + rows, key=lambda row: row["run"]))
 
 
 def conditions(episodes: Sequence[Row]) -> list[Row]:

@@ -8,11 +8,12 @@ import torch
 from torchrl_l1.algorithms import METRPO, METRPOConfig, Perturbation
 from torchrl_l1.algorithms.config import ModelConfig
 from torchrl_l1.algorithms.metrpo_config import PolicyConfig
+from torchrl_l1.algorithms.outcomes import OUTCOME_METRICS
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.objectives import TRPOConfig
 
-METRICS = METRPO.facts.metrics
+METRICS = METRPO.facts.metrics.keys() - OUTCOME_METRICS.keys()
 
 L1 = L1Config(0.04, epsilon=0.2, action_low=-3.0, action_high=3.0)
 ROBUST = L1Config.robust(0.04, action_low=-3.0, action_high=3.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from benchmarks import collection, l1_controllers, l1_scaling
+from benchmarks import collection, l1_controllers, l1_scaling, l1_single
 
 
 def test_scaling_has_a_row_per_size_and_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -39,3 +39,16 @@ def test_controllers_have_a_row_per_task_and_size(monkeypatch: pytest.MonkeyPatc
     table = l1_controllers.table(1)
     assert [row["task"] for row in table.rows] == ["inverted_pendulum", "half_cheetah"]
     assert all(set(table.columns) <= set(row) for row in table.rows)
+
+
+def test_a_single_environment_is_measured_with_and_without_seals(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(l1_single, "TASKS", {"InvertedPendulum-v5": (4, 1)})
+    monkeypatch.setattr(l1_single, "HIDDEN", (8,))
+    before = l1_single.transform.sealed
+    table = l1_single.table(1)
+    assert l1_single.transform.sealed is before
+    (row,) = table.rows
+    assert set(table.columns) <= set(row)
+    assert float(row["paper"]) > 0 and float(row["seal_share"]) < 1

@@ -1,13 +1,16 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import gymnasium
 import pytest
 import torch
 from torchrl.envs import (
     Compose,
+    EnvBase,
     FrameSkipTransform,
     GymEnv,
     GymWrapper,
@@ -16,9 +19,11 @@ from torchrl.envs import (
     SerialEnv,
     StepCounter,
     TransformedEnv,
+    VecNorm,
+    VecNormV2,
 )
 
-from torchrl_l1.control import L1Transform, time_step
+from torchrl_l1.control import L1Controller, L1Transform, time_step
 from torchrl_l1.envs import TASKS, BatchedMujocoEnv, MujocoTaskEnv
 
 pendulum = partial(GymEnv, "Pendulum-v1")
@@ -115,3 +120,66 @@ def test_a_transform_appended_later_is_checked_at_the_next_reset():
     env.append_transform(FrameSkipTransform(2))
     with pytest.raises(ValueError, match="FrameSkipTransform comes after L1Transform"):
         env.reset()
+
+
+def normalised(kind: type[VecNorm | VecNormV2], frozen: bool, outside: bool) -> TransformedEnv:
+    """A pendulum behind a running normaliser, which has seen some steps."""
+    env = TransformedEnv(pendulum(), kind(in_keys=["observation"]))
+    env.rollout(5)
+    if frozen:
+        env.transform.freeze()
+    return TransformedEnv(env, StepCounter(), auto_unwrap=False) if outside else env
+
+
+def gymnasium_normalised(frozen: bool) -> GymWrapper:
+    env = gymnasium.wrappers.NormalizeObservation(gymnasium.make("Pendulum-v1"))
+    env.update_running_mean = not frozen
+    return GymWrapper(env)
+
+
+def with_face(face: str, env: EnvBase, **settings: Any) -> EnvBase:
+    if face == "transform":
+        return TransformedEnv(env, L1Transform(model, **settings), auto_unwrap=False)
+    controller = L1Controller(model, observation_dim=3, action_dim=1, **settings)
+    return TransformedEnv(env, controller.make_primer(), auto_unwrap=False)
+
+
+FACES = ("transform", "controller")
+NORMALISED = {
+    "VecNorm": partial(normalised, VecNorm),
+    "VecNormV2": partial(normalised, VecNormV2),
+    "NormalizeObservation": lambda frozen, outside: gymnasium_normalised(frozen),
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*VecNorm:FutureWarning")
+@pytest.mark.parametrize("face", FACES)
+@pytest.mark.parametrize("outside", [False, True])
+@pytest.mark.parametrize("name", NORMALISED)
+def test_statistics_that_change_before_l1_are_noticed(face, outside, name):
+    make = NORMALISED[name]
+    with pytest.warns(UserWarning, match=f"{name} stands between .* changes its statistics"):
+        with_face(face, make(frozen=False, outside=outside)).reset()
+    with_face(face, make(frozen=True, outside=outside)).reset()
+
+
+def test_statistics_that_change_in_each_environment_are_noticed():
+    base = SerialEnv(2, partial(gymnasium_normalised, False))
+    with pytest.warns(UserWarning, match="NormalizeObservation stands between"):
+        TransformedEnv(base, L1Transform(model, dt=0.05)).reset()
+
+
+def test_statistics_that_change_elsewhere_do_not_matter():
+    own = VecNormV2(in_keys=["observation"], out_keys=["normal"])
+    TransformedEnv(pendulum(), Compose(own, L1Transform(model))).reset()
+
+
+@pytest.mark.filterwarnings("ignore:.*VecNorm:FutureWarning")
+@pytest.mark.parametrize("face", FACES)
+def test_bounds_beyond_those_of_the_environment_are_noticed(face):
+    for bounds in ({"action_high": 3.0}, {"action_low": -3.0}, {"action_high": (2.5,)}):
+        with pytest.warns(UserWarning, match="the environment's action ends at -?2.0"):
+            with_face(face, pendulum(), **bounds).reset()
+    # Less authority is a choice, and infinite bounds say that the spec is wrong.
+    for bound in (1.0, 2.0, math.inf):
+        with_face(face, pendulum(), action_low=-bound, action_high=bound).reset()

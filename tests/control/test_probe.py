@@ -351,3 +351,26 @@ def test_threads_get_what_one_thread_gets():
         assert not isinstance(found, Exception), found
         assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
     assert len(results) == 8
+
+
+def test_observations_in_other_units_than_those_of_the_fit_are_noticed():
+    torch.manual_seed(0)
+    ensemble = EnsembleDynamics(N, M, members=2, hidden=(8,))
+    config = L1Config(0.05)
+    seen = torch.tensor([1.0, 100.0, 0.0]) * (torch.rand(200, N) - 0.5)
+    x, u = torch.tensor([[0.4, -40.0, 0.3]]).expand(3, N), torch.zeros(3, M)
+
+    def first_step(observation: torch.Tensor) -> None:
+        step = make_step(config, ActionJacobian(ensemble), False)
+        step(init([len(observation)], N, M), observation, u[: len(observation)])
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        first_step(100 * x)  # nothing is known of a fit
+        ensemble.box.fit(seen)
+        first_step(x)  # the third entry did not vary
+        first_step(torch.cat([x[:2], 100 * x[:1]]))  # a single one may be odd
+    with pytest.warns(UserWarning, match=r"the model EnsembleDynamics .* in the entries \[0, 1\]"):
+        first_step(10 * x)
+    with pytest.warns(UserWarning, match="other units"):
+        first_step(x[:1] - torch.tensor([4.0, 0.0, 0.0]))

@@ -8,7 +8,16 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.collectors import MultiAsyncCollector, MultiSyncCollector
-from torchrl.envs import AsyncEnvPool, Compose, GymEnv, StepCounter, TransformedEnv
+from torchrl.envs import (
+    AsyncEnvPool,
+    CatTensors,
+    Compose,
+    GymEnv,
+    PendulumEnv,
+    StepCounter,
+    TransformedEnv,
+    UnsqueezeTransform,
+)
 from torchrl.envs.utils import step_mdp
 
 from torchrl_l1.control import (
@@ -154,3 +163,32 @@ def test_policy_and_core_are_exported():
     assert all(
         torch.allclose(a, b) for a, b in zip(mine, theirs, strict=True) if a.is_floating_point()
     )
+
+
+# Tracing takes some seconds; a compiler behind it would add a minute and prove no more.
+@pytest.mark.filterwarnings("ignore:A reset tensordict carrying state:FutureWarning")
+def test_a_step_of_a_whole_environment_compiles_into_one_graph():
+    torch.manual_seed(0)
+    base = PendulumEnv()  # in torch; Gymnasium's would end the graph where it steps
+    parts = ["th", "thdot"], ["angle", "rate"]
+    vector = CatTensors(["angle", "rate"], "observation", del_keys=False)
+    ensemble = EnsembleDynamics(2, 1, members=2, hidden=(8,)).eval()
+    apart = UnsqueezeTransform(-1, in_keys=parts[0], out_keys=parts[1])
+    chain = Compose(apart, vector, L1Transform(ensemble, epsilon=0.5))
+    env = TransformedEnv(base, chain)
+
+    def step(data: TensorDictBase) -> TensorDictBase:
+        return env.step(data.set("action", act(data["observation"])))
+
+    first = env.reset(base.gen_params(batch_size=[3]))
+    compiled = torch.compile(step, backend="eager", fullgraph=True)
+    mine = theirs = first
+    for _ in range(4):
+        mine, theirs = step(mine.clone()), compiled(theirs.clone())
+        torch.testing.assert_close(theirs["next", "l1"], mine["next", "l1"], atol=0, rtol=0)
+        mine, theirs = env.step_mdp(mine), env.step_mdp(theirs)
+    assert (mine["l1", "q"] != 0).any()
+    # The seal is checked there too.
+    theirs["observation"] = theirs["observation"] + 1
+    with pytest.raises(ValueError, match="is not what the environment gave"):
+        compiled(theirs)

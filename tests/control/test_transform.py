@@ -490,3 +490,13 @@ def test_environments_that_are_done_wait_for_the_others(model):
     first, second = (int(row.nonzero()[0]) for row in data["next", "done"].squeeze(-1))
     assert second < first == data.shape[1] - 1
     assert torch.equal(data["next", "l1", "q"][1, second], data["next", "l1", "q"][1, -1])
+
+
+def test_resets_share_no_memory():
+    env = make_env(L1Transform(make_model(), dt=0.05))
+    first = env.reset()
+    for value in first["l1"].values():
+        value.fill_(1)
+    second = env.reset()
+    assert all((value == 0).all() for name, value in second["l1"].items() if name != "seal")
+    assert second["l1"].keys() == first["l1"].keys()

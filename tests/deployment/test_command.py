@@ -2,10 +2,17 @@ from __future__ import annotations
 
 import csv
 import shlex
+from argparse import Namespace
 
 import pytest
+import wandb
 
-from torchrl_l1.cli import main
+from torchrl_l1.cli import main, robustify
+from torchrl_l1.envs import suite
+from torchrl_l1.experiment.evaluate import TrainedRun
+from torchrl_l1.experiment.settings import METRPORecipe
+from torchrl_l1.experiment.tracking import Evaluated
+from torchrl_l1.experiment.wandb_files import draw_id
 
 TINY = ["--steps", "300", "--episodes", "2", "--most-steps", "15"]
 
@@ -68,3 +75,55 @@ def test_from_a_policy_to_a_controller_that_python_loads(policy_file, tmp_path, 
 def test_refusals_of_one_line(line, message, capsys, monkeypatch):
     monkeypatch.setenv("DISPLAY", ":0")
     assert message in refused(shlex.split(line), capsys)
+
+
+def test_what_a_training_s_policy_is_worth_is_logged_to_the_training(tmp_path, monkeypatch):
+    recipe = METRPORecipe(outer_iterations=1, task="hopper", recipe="mine")
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+    draw_id(run_dir)
+    logged = []
+    monkeypatch.setattr(robustify, "load_run", lambda path: TrainedRun(run_dir, recipe, None))
+    monkeypatch.setattr(robustify, "log_evaluation", lambda *arguments: logged.append(arguments))
+    chart = tmp_path / "chart.png"
+    for policy in (run_dir, run_dir / "checkpoints" / "best.pt"):
+        options = Namespace(policy=str(policy), env="gymnasium/Hopper-v5", wandb="offline")
+        robustify._log(options, [{"bias": 1.0}], chart, tmp_path)
+        own, path, evaluated = logged.pop()
+        assert (own.wandb.mode, own.recipe, path) == ("offline", "mine", run_dir)
+        assert evaluated == Evaluated("robustify/gymnasium_Hopper-v5", [{"bias": 1.0}], [chart])
+
+
+@pytest.mark.filterwarnings("ignore:the model is too poor")
+def test_a_suite_with_what_weights_and_biases_is_told(policy_file, tmp_path, monkeypatch):
+    told: dict[str, object] = {}
+
+    class Run:
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            told["ended"] = error
+
+        def log(self, values):
+            told.update(values)
+
+    def init(**options):
+        told["options"] = options
+        return Run()
+
+    monkeypatch.setattr(wandb, "init", init)
+    output = tmp_path / "out"
+    policy = f"{policy_file}:balance"
+    main(["robustify", "inverted_pendulum", "--policy", policy, "--suite", "quick",
+          "--steps", "300", "--episodes", "1", "--most-steps", "4",
+          "--wandb", "offline", "--output", str(output)])  # fmt: skip
+    with (output / "evaluation.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    cells = len(suite("quick"))
+    assert len([row for row in rows if row["l1"] == "off"]) == cells
+    # Where a disturbance is not matched there is nothing that an oracle could be told.
+    assert 0 < len([row for row in rows if row["l1"] == "oracle"]) < cells
+    assert told["options"]["mode"] == "offline" and told["options"]["config"]["suite"] == "quick"
+    assert len(told["evaluation"].data) == len(rows) and told["chart"] is not None
+    assert told["ended"] == (None, None, None)

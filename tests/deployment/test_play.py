@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from matplotlib.animation import FuncAnimation
 from PIL import Image
 
+from torchrl_l1.cli import main
 from torchrl_l1.deployment import play
 from torchrl_l1.envs.rendering import RenderingUnavailable
 
@@ -59,7 +63,9 @@ def test_a_film_of_an_episode(robust):
         pytest.skip(f"this machine has no off-screen OpenGL: {error}")
     off, on = films
     assert (off.label, on.label) == ("L1 off", "L1 robust")
-    assert off.frames[0].shape == (60, 80, 3) and 11 <= len(off.frames) <= 12
+    assert off.frames[0].shape == (60, 80, 3)
+    # One for each step, the last included; with a reward of one in each that does not fall.
+    assert len(off.frames) == 12
     # L1 cancels the bias: the two part.
     assert (off.frames[-1] != on.frames[-1]).any() and off.total < on.total
 
@@ -73,3 +79,56 @@ def test_poses_of_gymnasiums_own_environments(robust):
     np.testing.assert_allclose(play._pose(env), data["observation"][:2].numpy(), rtol=1e-6)
     assert play._physics(env)[0].nq == 2
     assert play._physics(environment_source("Pendulum-v1").one()) is None
+
+
+class Watched(FuncAnimation):
+    """An animation that a test can wind on."""
+
+    def __init__(self, *arguments, **options) -> None:
+        super().__init__(*arguments, **options)
+        Watched.last = self
+
+
+def watching(monkeypatch, count: int) -> list[int]:
+    """A viewer that looks at so many frames, as gray values, before it closes the window."""
+    seen = []
+
+    def look() -> None:
+        figure = play.pyplot.gcf()
+        figure.canvas.draw()
+        for _ in range(count):
+            seen.append(int(figure.axes[0].images[0].get_array()[30, 30, 0]))
+            Watched.last._step()
+        play.pyplot.close(figure)
+
+    monkeypatch.setattr(play, "FuncAnimation", Watched)
+    switch = play.pyplot.switch_backend
+    monkeypatch.setattr(play.pyplot, "switch_backend", lambda backend: switch("Agg"))
+    monkeypatch.setattr(play.pyplot, "show", look)
+    return seen
+
+
+@pytest.mark.parametrize(("dt", "every", "interval"), [(0.04, 1, 40), (0.005, 4, 20)])
+def test_a_window_shows_the_film_in_real_time(monkeypatch, dt, every, interval):
+    seen = watching(monkeypatch, 5)
+    frames = [np.full((60, 200, 3), 10 * k, np.uint8) for k in range(20)]
+    play.show_film(frames, dt, "pendulum")
+    # The first frame is drawn twice, by the canvas and as the animation begins.
+    assert list(dict.fromkeys(seen))[:4] == [10 * every * k for k in range(4)]
+    assert Watched.last.event_source.interval == interval
+
+
+def test_the_command_opens_a_window(robust, policy_file, tmp_path, monkeypatch, capsys):
+    replace(robust, origin={"policy": f"{policy_file}:balance"}).save(tmp_path / "controller")
+    monkeypatch.setenv("DISPLAY", ":0")
+    seen = watching(monkeypatch, 3)
+    arguments = ["play", str(tmp_path), "--trust", "--bias", "1", "--compare", "--steps", "5"]
+    try:
+        main(arguments)
+    except SystemExit:
+        if "off-screen" in (message := capsys.readouterr().err):
+            pytest.skip(message)
+        raise
+    assert len(seen) == 3
+    printed = capsys.readouterr().out
+    assert "L1 off: return" in printed and "L1 robust: return" in printed

@@ -6,10 +6,18 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.data import Bounded, Unbounded
 from torchrl.envs import GymEnv
+from torchrl.modules import LSTMModule
 
-from torchrl_l1.deployment import FunctionPolicy, load_policy, vector_environment
+from torchrl_l1.deployment import (
+    FunctionPolicy,
+    environment_source,
+    load_policy,
+    vector_environment,
+)
+from torchrl_l1.deployment.learning import policy_transforms
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.run import run
 
@@ -179,3 +187,113 @@ def test_statistics_of_vecnormalize_need_a_word(env, tmp_path):
 def test_normalization_of_another_policy_is_refused(env):
     with pytest.raises(ValueError, match="belongs to policies of Stable-Baselines3"):
         load_policy(balance, env, normalization="statistics.pkl")
+
+
+GAIN = np.array([[1.0, 10.0, 1.0, 2.0]], np.float32)
+
+
+@pytest.mark.parametrize(
+    ("function", "rows", "arrays"),
+    [
+        (lambda x: GAIN @ x, True, True),
+        (lambda x: x @ GAIN.T, False, True),
+        (lambda x: GAIN @ [x[0], np.tan(np.arctan(x[1])), x[2], x[3]], True, True),
+        (lambda x: float(np.dot(GAIN[0], x)), True, True),
+    ],
+    ids=["row", "batch", "row of parts", "number"],
+)
+def test_functions_of_arrays(env, function, rows, arrays):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        policy = load_policy(function, env)
+        found = actions(policy, OBSERVATION)
+    assert (policy.rows, policy.arrays) == (rows, arrays)
+    torch.testing.assert_close(found, balance(OBSERVATION))
+
+
+def test_a_batch_that_is_taken_for_one_observation_is_noticed():
+    # Two entries and two actions: rows and columns can be confused, and the shape is right.
+    box = Bounded(-10.0, 10.0, (2,))
+    gain = torch.tensor([[1.0, 2.0], [0.0, 1.0]])
+    policy = FunctionPolicy(lambda x: gain @ x, Unbounded(2), box)
+    x = torch.tensor([[1.0, 2.0], [3.0, -1.0]])
+    assert policy.rows
+    torch.testing.assert_close(actions(policy, x), x @ gain.T)
+    # A mean over the batch.
+    policy = FunctionPolicy(lambda x: 0.1 * (x - x.mean()), Unbounded(2), box)
+    assert policy.rows
+
+
+class Integrator:
+    """A controller that remembers."""
+
+    total = 0.0
+
+    def __call__(self, x):
+        self.total += float(x.reshape(-1)[1])
+        return [10 * self.total]
+
+
+def test_a_function_that_remembers_or_draws_is_noticed(env):
+    for function in (Integrator(), lambda x: torch.randn(*x.shape[:-1], 1)):
+        with pytest.warns(UserWarning, match="another action for the same observation"):
+            load_policy(function, env)
+
+
+def test_modules_of_another_precision(env):
+    module = torch.nn.Linear(4, 1).double()
+    policy = load_policy(module, env)
+    found = actions(policy, OBSERVATION)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, module(OBSERVATION.double()).float().detach())
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ((["normalised"], ["action"]), r"reads \['normalised'\], which the environment does not"),
+        ((["observation"], ["loc"]), r"writes \['loc'\] and no 'action'"),
+    ],
+)
+def test_modules_of_another_environment_are_refused(env, keys, message):
+    with pytest.raises(ValueError, match=message):
+        load_policy(TensorDictModule(balance, *keys), env)
+
+
+def recurrent_policy() -> TensorDictSequential:
+    torch.manual_seed(0)
+    keys = ["observation", "rs_h", "rs_c"], ["features", ("next", "rs_h"), ("next", "rs_c")]
+    lstm = LSTMModule(input_size=4, hidden_size=8, in_keys=keys[0], out_keys=keys[1])
+    return TensorDictSequential(
+        lstm, TensorDictModule(torch.nn.Linear(8, 1), ["features"], ["action"])
+    )
+
+
+def test_the_memory_of_a_recurrent_policy_is_carried(env):
+    policy = load_policy(recurrent_policy(), env)
+    source = environment_source("InvertedPendulum-v5")
+    data = source.several(2, control=policy_transforms(policy, source.one), seed=0).rollout(
+        20, policy, break_when_any_done=False
+    )
+    first = data["is_init"].squeeze(-1)
+    assert first.any() and (data["rs_h"][first] == 0).all()
+    later = ~first[:, 1:]
+    torch.testing.assert_close(data["rs_h"][:, 1:][later], data["next", "rs_h"][:, :-1][later])
+    assert (data["rs_h"][:, 1:][later] != 0).any()
+    # An environment that has all this already gets none of it again.
+    own = source.single(control=policy_transforms(policy, source.one))
+    assert policy_transforms(policy, lambda: own) == []
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_model_of_stable_baselines_brings_its_normaliser(env):
+    sb3 = pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    normalized = VecNormalize(make_vec_env("InvertedPendulum-v5", 1), clip_obs=2.0)
+    normalized.obs_rms.mean, normalized.obs_rms.var = np.full(4, 0.02), np.full(4, 0.003)
+    model = sb3.PPO("MlpPolicy", normalized, seed=0, device="cpu")
+    scaled = normalized.normalize_obs(OBSERVATION.numpy())
+    expected = torch.as_tensor(model.predict(scaled, deterministic=True)[0])
+    torch.testing.assert_close(actions(load_policy(model, env), OBSERVATION), expected)

@@ -5,13 +5,15 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torchrl.envs import EnvBase, GymEnv
+from tensordict.nn import TensorDictModule
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs import EnvBase, GymEnv, TransformedEnv
 
 import torchrl_l1
 from torchrl_l1.control import L1Transform
 from torchrl_l1.deployment import RobustController, load_target, robustify
 from torchrl_l1.dynamics import FitConfig
-from torchrl_l1.envs import make_env
+from torchrl_l1.envs import ActuatorBias, make_env
 from torchrl_l1.experiment.run import run
 
 from .conftest import balance
@@ -62,6 +64,38 @@ def test_what_is_saved_acts_the_same(robust, policy_file, tmp_path):
     assert load_target(str(tmp_path), trusted=True).configs == robust.configs
     with pytest.raises(ValueError, match="say --trust"):
         load_target(str(tmp_path))
+
+
+@pytest.mark.filterwarnings("ignore:the model is too poor")
+@pytest.mark.parametrize("form", ["rows", "buffer", "list"])
+def test_recorded_data_take_the_place_of_collected_ones(form):
+    torch.manual_seed(0)
+
+    def explore(x: torch.Tensor) -> torch.Tensor:
+        return balance(x.float()) + torch.randn(*x.shape[:-1], 1)
+
+    policy = TensorDictModule(explore, ["observation"], ["action"])
+    # Of float64, and with the resets of episodes that end.
+    data = TransformedEnv(GymEnv("InvertedPendulum-v5")).rollout(
+        300, policy, break_when_any_done=False
+    )
+    data["observation"][7] = torch.nan
+    given = {"rows": data, "list": [data[:150], data[150:]]}.get(form)
+    if form == "buffer":
+        given = ReplayBuffer(storage=LazyTensorStorage(300))
+        given.extend(data)
+    with pytest.warns(UserWarning, match="not finite"):
+        made = robustify("InvertedPendulum-v5", balance, data=given, fit=QUICK, **TINY, steps=10**9)
+    quality = made.model.quality
+    assert quality.training + quality.validation == 299
+    assert made.settings("paper").epsilon > 0
+    assert made.model.residuals.calibrated
+
+
+def test_data_of_another_environment_are_refused():
+    data = GymEnv("Pendulum-v1").rollout(50)
+    with pytest.raises(ValueError, match=r"an observation of width 3, and the .* one of 4"):
+        robustify("inverted_pendulum", balance, data=data, progress=False)
 
 
 @pytest.mark.parametrize("content", ["[]", "3", "{}", '{"format": 1}', "{", '{"format": 7}', ""])
@@ -140,8 +174,6 @@ def test_a_poor_model_is_noticed():
             return torch.zeros_like(x[..., :1])
 
     def make() -> EnvBase:
-        from torchrl.envs import TransformedEnv
-
         from torchrl_l1.envs import ObservationNoise
 
         return TransformedEnv(GymEnv("InvertedPendulum-v5"), ObservationNoise(2.0))
@@ -164,3 +196,12 @@ def test_targets_that_are_none(tmp_path):
         load_target("gymnasium/Pendulum-v1")
     with pytest.raises(ValueError, match="leave --policy out"):
         load_target(str(tmp_path), policy="sb3:x.zip")
+
+
+@pytest.mark.filterwarnings("ignore:the model is too poor")
+def test_a_disturbance_in_the_data_is_noticed():
+    def make() -> EnvBase:
+        return TransformedEnv(GymEnv("InvertedPendulum-v5"), ActuatorBias(0.5))
+
+    with pytest.warns(UserWarning, match="brings ActuatorBias along"):
+        robustify(make, balance, 60, fit=QUICK, **TINY)

@@ -13,15 +13,18 @@ import pytest
 import torch
 from omegaconf import DictConfig
 
+from tests.attack import kills
 from torchrl_l1.algorithms import METRPO
 from torchrl_l1.algorithms.algorithm import Algorithm, Diverged
 from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.policy_improvement import PolicyImprovement
+from torchrl_l1.envs.simulation import TaskSimulation
 from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.run_directory import RunDirectory
 from torchrl_l1.experiment.signals import RESUME_ME, orderly_end
+from torchrl_l1.objectives.gaussian_trpo import _GaussianProblem
 from torchrl_l1.report import report
 
 Recipe = Callable[..., DictConfig]
@@ -184,3 +187,81 @@ def test_a_warning_lets_the_iteration_be_finished(
     assert RunDirectory(tmp_path / "run").iterations_done() == 1
     run(tiny_recipe("resume=true"))
     assert (tmp_path / "run/metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
+
+
+def spoil_simulation(monkeypatch: pytest.MonkeyPatch, at: int) -> None:
+    """From its n-th step on the simulation gives rewards that are no numbers."""
+    step, count = TaskSimulation.step, iter(range(10**9))
+
+    def spoilt(self: TaskSimulation, action: torch.Tensor) -> Any:
+        found = step(self, action)
+        return found._replace(reward=found.reward * (math.nan if next(count) >= at else 1.0))
+
+    monkeypatch.setattr(TaskSimulation, "step", spoilt)
+
+
+def spoil_curvature(monkeypatch: pytest.MonkeyPatch, at: int) -> None:
+    """From its n-th product on the Fisher matrix of TRPO is no number."""
+    product, count = _GaussianProblem.fisher_product, iter(range(10**9))
+
+    def spoilt(self: _GaussianProblem, vector: torch.Tensor) -> torch.Tensor:
+        return product(self, vector) * (math.nan if next(count) >= at else 1.0)
+
+    monkeypatch.setattr(_GaussianProblem, "fisher_product", spoilt)
+
+
+DIVERGING: dict[str, tuple[str, list[str], Callable[..., None], str]] = {
+    "METRPO, curvature": (
+        "metrpo/inverted_pendulum",
+        kills.METRPO_TINY,
+        spoil_curvature,
+        r"TRPO: trpo/kl is nan; look at trpo\.max_kl",
+    ),
+    "PETS, weights": (
+        "pets/inverted_pendulum",
+        kills.PETS_TINY,
+        spoil_model,
+        "fit: weights of the model are not finite",
+    ),
+    "PETS, rewards": ("pets/inverted_pendulum", kills.PETS_TINY, spoil_simulation, "is nan"),
+    "MBMF, weights": (
+        "mbmf/inverted_pendulum",
+        kills.MBMF_TINY,
+        spoil_model,
+        "fit: weights of the model are not finite",
+    ),
+    "MBMF, rewards": (
+        "mbmf/inverted_pendulum",
+        kills.MBMF_TINY,
+        spoil_simulation,
+        "PPO: non-finite advantages",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", list(DIVERGING))
+@pytest.mark.parametrize("mode", ["stop", "warn"])
+def test_every_algorithm_stops_or_counts_and_is_reported(
+    name: str, mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, overrides, spoil, words = DIVERGING[name]
+    folder = tmp_path / "run"
+    config = compose(recipe, [*overrides, f"on_divergence={mode}", f"run_dir={folder}"])
+    # Late enough for a first iteration that is whole.
+    spoil(monkeypatch, at={"weights": 1, "rewards": 60, "curvature": 30}[name.split(", ")[1]])
+    if mode == "stop":
+        with pytest.raises(
+            RunDirectoryError, match=rf"training diverged in iteration \d+, .*{words}"
+        ):
+            run(config)
+    else:
+        run(config)
+    table = rows(folder)
+    assert len(table) == config.outer_iterations or mode == "stop"
+    assert any(float(row["diverged"] or 0) > 0 for row in table) and RunDirectory(folder).intact()
+    if all(math.isfinite(float(row["return_mean"])) for row in table):
+        text = report([folder], tmp_path / "report").read_text()
+        assert "Trainings that diverged:" in text
+    else:  # then it is left out, and the reason is told
+        with pytest.raises(RunDirectoryError, match=r"return_mean is .nan.*training diverged in"):
+            report([folder], tmp_path / "report")

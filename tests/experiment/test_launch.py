@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
+from hydra.core.plugins import Plugins
 
 from torchrl_l1.campaign.description import CampaignError, read_campaign
 from torchrl_l1.campaign.plan import plan
@@ -136,6 +139,7 @@ def test_a_key_that_no_schema_knows_is_refused_with_a_plus_too(
         (["-m", "label=both"], "label must be"),
         (["-m", "seed=range(3,3)"], "matches nothing"),
         (["-m", "l1=glob(zz*)"], "matches nothing"),
+        (["-m", "discount=interval(0.9,0.99)"], "interval"),
         (["l1.alpha=0.1", "l1.cutoff=3"], "cutoff"),
         (["-m", "l1.alpha=0.1", "l1.cutoff=3"], "cutoff"),
     ],
@@ -207,3 +211,44 @@ def test_names_that_lead_elsewhere_are_refused(
 def test_launch_needs_a_recipe_that_there_is() -> None:
     with pytest.raises(RecipeError, match="Did you mean"):
         launch("metrpo/half_cheeta", [])
+
+
+def test_a_sweeper_is_told_the_final_return(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tiny_overrides: list[str]
+) -> None:
+    told: list[float] = []
+    # Hydra loads its plug-ins in its own way: the class is not the one that could be imported.
+    sweeper = Plugins.instance().class_name_to_class[
+        "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
+    ]
+    sweep = sweeper.sweep
+
+    def recorded(self: Any, arguments: list[str]) -> None:
+        told.extend(job.return_value for batch in sweep(self, arguments) for job in batch)
+
+    monkeypatch.setattr(sweeper, "sweep", recorded)
+    own = [*tiny_overrides, "outer_iterations=4", "discount=0.9,0.99"]
+    main(["run", PENDULUM, "-m", *own, "run_dir=runs/${discount}"])
+    for value, discount in zip(told, ("0.9", "0.99"), strict=True):
+        with (tmp_path / "runs" / discount / "metrics.csv").open() as file:
+            returns = [float(row["return_mean"]) for row in csv.DictReader(file)]
+        assert len(returns) == 4 and value == pytest.approx(sum(returns[-3:]) / 3)
+
+
+@pytest.mark.filterwarnings("ignore")  # it asks for an old Optuna
+def test_hydras_optuna_sweeper_looks_for_the_best_return(
+    tmp_path: Path, tiny_overrides: list[str]
+) -> None:
+    optuna = pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+    assert optuna
+    own = [*tiny_overrides, "outer_iterations=1", "discount=interval(0.9,0.99)"]
+    sweeper = ["hydra/sweeper=optuna", "hydra.sweeper.direction=maximize"]
+    sweeper += ["hydra.sweeper.n_trials=2", "hydra.sweeper.n_jobs=1", "hydra.sweep.dir=swept"]
+    main(["run", PENDULUM, "-m", *own, *sweeper])
+    best = yaml.safe_load((tmp_path / "swept" / "optimization_results.yaml").read_text())
+    returns = []
+    for metrics in (tmp_path / "runs").rglob("metrics.csv"):
+        with metrics.open() as file:
+            returns += [float(row["return_mean"]) for row in csv.DictReader(file)]
+    assert len(returns) == 2
+    assert best["best_value"] == pytest.approx(max(returns))

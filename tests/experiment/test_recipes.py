@@ -26,6 +26,7 @@ from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import (
     available_campaigns,
     available_recipes,
+    copy_recipe,
     find_recipe,
     recipes_dir,
 )
@@ -41,7 +42,8 @@ RUN_DIR = "run_dir=unused"
 
 
 def composed(name: str, *overrides: str) -> RunSettings:
-    recipe = OmegaConf.to_object(compose(name, [RUN_DIR, *overrides]))
+    task = ["task=gymnasium/Pendulum-v1"] if name.endswith("/any") else []
+    recipe = OmegaConf.to_object(compose(name, [RUN_DIR, *task, *overrides]))
     assert isinstance(recipe, RunSettings)
     return recipe
 
@@ -216,6 +218,69 @@ def test_a_users_own_recipe_may_include_a_shipped_one(tmp_path: Path) -> None:
     assert not recipe.l1.enabled
 
 
+def test_a_users_own_recipe_inherits_a_shipped_one_by_a_line(tmp_path: Path) -> None:
+    own = tmp_path / "mine.yaml"
+    own.write_text("defaults: [dets/half_cheetah, _self_]\nparticles: 7\n")
+    recipe = composed(str(own), "preset=paper", "l1=off")
+    assert isinstance(recipe, PETSRecipe)
+    assert (recipe.recipe, recipe.task, recipe.particles) == ("mine", "half_cheetah", 7)
+    assert recipe.model.head == "deterministic" and not recipe.l1.enabled
+    own.write_text("defaults: [metrpo/hopper, {override l1: 'off'}, _self_]\n")
+    assert not typed(str(own)).l1.enabled
+    assert typed(str(own), "recipe=other").recipe == "other"
+
+
+@pytest.mark.parametrize("entry", ["l1: off", "override l1: off", "l1: no"])
+def test_an_option_that_yaml_takes_for_false_is_named(entry: str, tmp_path: Path) -> None:
+    own = tmp_path / "mine.yaml"
+    own.write_text(f"defaults:\n  - metrpo_recipe\n  - {entry}\n")
+    key, _, word = entry.partition(": ")
+    message = f"mine.yaml: defaults: {entry} means false in YAML; write {key}: '{word}'"
+    with pytest.raises(RecipeError, match=message):
+        composed(str(own))
+
+
+@pytest.mark.parametrize("name", available_recipes())
+def test_a_copy_of_a_recipe_is_that_recipe_under_another_name(name: str, tmp_path: Path) -> None:
+    copy = copy_recipe(name, str(tmp_path / "mine.yaml"))
+    mine, shipped = composed(str(copy)), composed(name)
+    assert mine.recipe == "mine"
+    mine.recipe = name
+    assert mine == shipped
+
+
+def test_copies_have_names_and_replace_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    copy = copy_recipe("pets/half_cheetah")
+    assert str(copy) == "pets_half_cheetah.yaml"
+    copy.write_text("mine")
+    with pytest.raises(RecipeError, match="is there already"):
+        copy_recipe("pets/half_cheetah")
+    assert copy.read_text() == "mine"
+    with pytest.raises(RecipeError, match=r"must end in \.yaml"):
+        copy_recipe("pets/half_cheetah", "mine.yml")
+    with pytest.raises(RecipeError, match="Did you mean pets/half_cheetah"):
+        copy_recipe("pets/half_cheeta")
+    campaign = read_campaign(str(copy_recipe("table1_first")))
+    assert campaign.to_dict()["runs"] == read_campaign("table1_first").to_dict()["runs"]
+
+
+def test_files_that_are_nearly_there_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.yml").touch()
+    (tmp_path / "other.yaml").touch()
+    with pytest.raises(RecipeError, match=r"rename mine\.yml"):
+        find_recipe("mine.yaml")
+    with pytest.raises(RecipeError, match="rename it"):
+        find_recipe("mine.yml")
+    with pytest.raises(RecipeError, match=r"Did you mean the file other\.yaml\?"):
+        find_recipe("other")
+
+
 @pytest.mark.parametrize("name", [n for n in available_recipes() if n.startswith("metrpo/")])
 def test_every_recipe_has_an_affine_variant_of_the_same_settings(name: str) -> None:
     for overrides in ([], ["preset=paper"], ["model.hidden=[8]"]):
@@ -263,6 +328,16 @@ NEWER = {"fit.precision": "float32", "precision": "float32"} | {
 }
 NEWER |= {
     "on_divergence": "stop",
+    "loggers": ["wandb"],
+    "checkpoint": {"every": None, "best": False},
+    **dict.fromkeys(("wandb.entity", "wandb.group", "wandb.name", "wandb.notes")),
+    "wandb.tags": [],
+    "dt": None,
+    "observation_keys": [],
+    "search_path": [],
+    "reward": "builtin",
+    "termination": "builtin",
+    "outcome_model": {"members": 3, "hidden": [128, 128], "activation": "silu"},
     "l1.estimator": "least_squares",
     "l1.filter": "low_pass",
     "l1.covariance": "residuals",

@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import torchrl_l1
 from torchrl_l1.algorithms import METRPO, PETS
+from torchrl_l1.algorithms.outcomes import OUTCOME_METRICS
 from torchrl_l1.campaign.description import dump_yaml, read_campaign
 from torchrl_l1.campaign.plan import plan
 from torchrl_l1.cli import main
@@ -28,7 +29,7 @@ from torchrl_l1.experiment.matrix import conditions
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.run_directory import RunDirectory
 
-METRICS = METRPO.facts.metrics
+METRICS = METRPO.facts.metrics.keys() - OUTCOME_METRICS.keys()
 
 Recipe = Callable[..., DictConfig]
 
@@ -323,7 +324,7 @@ def rows(folder: Path) -> int:
     return len(file.read_text().splitlines()) - 1 if file.exists() else 0
 
 
-PETS_METRICS = PETS.facts.metrics
+PETS_METRICS = PETS.facts.metrics.keys() - OUTCOME_METRICS.keys()
 
 TINY_PETS = [
     "outer_iterations=2",

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -10,7 +12,8 @@ from torch.nn.utils import parameters_to_vector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_l1.algorithms.policy import GaussianPolicy, make_actor
-from torchrl_l1.objectives import TRPOConfig, conjugate_gradient, trpo_step
+from torchrl_l1.objectives import TRPOConfig, conjugate_gradient, gaussian_trpo_step, trpo_step
+from torchrl_l1.objectives.gaussian_trpo import _GaussianProblem
 from torchrl_l1.objectives.trpo import _AutogradProblem
 
 
@@ -110,3 +113,38 @@ def test_broken_advantages_are_refused() -> None:
     data["advantage"][3] = float("nan")
     with pytest.raises(ValueError, match="non-finite advantages"):
         trpo_step(actor, data, TRPOConfig())
+
+
+@pytest.mark.parametrize("closed_form", [False, True])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_curvature_of_no_number_is_no_step_and_is_told(
+    closed_form: bool, value: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch.manual_seed(0)
+    policy = GaussianPolicy(3, 2, (4,), std=0.7)
+    data = batch(make_actor(policy))
+    before = parameters_to_vector(policy.parameters()).clone()
+    problem = _GaussianProblem if closed_form else _AutogradProblem
+    monkeypatch.setattr(problem, "fisher_product", lambda self, v: torch.full_like(v, value))
+    if closed_form:
+        columns = (data[name] for name in ("observation", "action", "advantage"))
+        report = gaussian_trpo_step(policy.mean, policy.log_std, *columns, TRPOConfig())
+    else:
+        report = trpo_step(make_actor(policy), data, TRPOConfig())
+    assert not report.accepted and math.isnan(report.kl)
+    assert torch.equal(parameters_to_vector(policy.parameters()), before)
+
+
+def test_a_step_all_of_whose_candidates_are_no_numbers_is_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    torch.manual_seed(0)
+    policy = GaussianPolicy(3, 2, (4,), std=0.7)
+    actor = make_actor(policy)
+    data = batch(actor)
+    before = parameters_to_vector(policy.parameters()).clone()
+    nothing = torch.tensor(math.nan)
+    monkeypatch.setattr(_AutogradProblem, "evaluate", lambda self: (nothing, nothing))
+    report = trpo_step(actor, data, TRPOConfig())
+    assert not report.accepted and math.isnan(report.kl)
+    assert torch.equal(parameters_to_vector(policy.parameters()), before)

@@ -17,6 +17,7 @@ from torchrl_l1.algorithms.offline_config import (
     OfflineCloningConfig,
     OfflineConfig,
 )
+from torchrl_l1.algorithms.outcomes import OutcomeConfig, Outcomes
 from torchrl_l1.algorithms.pets import PETS
 from torchrl_l1.algorithms.pets_config import PETSConfig
 from torchrl_l1.envs import Perturbation
@@ -36,6 +37,8 @@ __all__ = [
     "Offline",
     "OfflineCloningConfig",
     "OfflineConfig",
+    "OutcomeConfig",
+    "Outcomes",
     "PETSConfig",
     "Perturbation",
     "PolicyConfig",

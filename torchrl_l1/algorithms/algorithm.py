@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -21,11 +21,12 @@ from torchrl_l1.algorithms.collection import RETURN_METRICS, Collection, seed_st
 from torchrl_l1.algorithms.config import ModelConfig, episode_length
 from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.algorithms.model_learning import FIT_METRICS, ModelLearning, fit_metrics
+from torchrl_l1.algorithms.outcomes import OUTCOME_METRICS, OutcomeConfig, Outcomes
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import FitConfig, calibrate_filter, make_dynamics
 from torchrl_l1.dynamics.network import model_precision
-from torchrl_l1.envs import Perturbation, get_task
+from torchrl_l1.envs import AnyTask, Perturbation, get_task
 
 DEVICES = ("cpu", "cuda", "auto")
 """Where models may be fitted and trajectories imagined."""
@@ -48,6 +49,7 @@ COMMON_METRICS: dict[str, str] = {
     "real_steps": "Real environment steps so far, the initial random ones included.",
     **RETURN_METRICS,
     **FIT_METRICS,
+    **OUTCOME_METRICS,
 }
 """What every algorithm logs."""
 
@@ -69,6 +71,8 @@ class Diverged(ValueError):
 # What is finite in every round of a training that goes well, and the settings behind it if not.
 _FINITE = {
     "model/": "fit.learning_rate, model.std_floor and the data's scale",
+    "reward_model/": "fit.learning_rate, model.std_floor and the rewards' scale",
+    "termination_model/": "fit.learning_rate and model.std_floor",
     "clone/": "cloning.learning_rate",
     "ppo/kl": "fine_tuning.learning_rate",
     "ppo/value_loss": "fine_tuning.value_learning_rate",
@@ -115,6 +119,10 @@ class Surroundings(TypedDict, total=False):
     device: str
     compile_l1: CompileMode
     on_phase: Callable[[str], None] | None
+    reward: str
+    termination: str
+    outcome_model: OutcomeConfig | None
+    search_path: Sequence[str]
 
 
 class Algorithm(ABC):
@@ -125,7 +133,7 @@ class Algorithm(ABC):
     steps there will be, and says what acts (:attr:`policies`).
 
     Args:
-        task: name of a task, see :data:`torchrl_l1.envs.TASKS`.
+        task: a task, or its name, see :func:`torchrl_l1.envs.get_task`.
         config: settings.
         l1: the adaptive controller of real environments; ``None`` for none.
         perturbation: noise and disturbances of the real environments.
@@ -137,6 +145,10 @@ class Algorithm(ABC):
         compile_l1: whether to compile the controller's step, see
             :class:`~torchrl_l1.control.L1Transform`.
         on_phase: called with a word on what is going on, for progress bars.
+        reward: of imagined trajectories, see :class:`~torchrl_l1.algorithms.Outcomes`.
+        termination: likewise.
+        outcome_model: of a learned reward and a learned termination.
+        search_path: folders for files and modules that reward and termination name.
 
     Attributes:
         facts: what is known of the algorithm without running it.
@@ -146,6 +158,7 @@ class Algorithm(ABC):
             finite, or to note it in the result of the iteration.
         dynamics: the model.
         acting_dynamics: the model that L1 uses in real environments, on the CPU.
+        outcomes: rewards and ends of what is imagined.
         learning: the model's data and fits.
         real: makes real environments, see :class:`~torchrl_l1.algorithms.collection.Collection`.
         horizon: steps per full real episode.
@@ -159,7 +172,7 @@ class Algorithm(ABC):
 
     def __init__(
         self,
-        task: str,
+        task: str | AnyTask,
         config: AlgorithmConfig,
         l1: L1Config | None = None,
         perturbation: Perturbation | None = None,
@@ -169,6 +182,10 @@ class Algorithm(ABC):
         device: str = "cpu",
         compile_l1: CompileMode = False,
         on_phase: Callable[[str], None] | None = None,
+        reward: str = "builtin",
+        termination: str = "builtin",
+        outcome_model: OutcomeConfig | None = None,
+        search_path: Sequence[str] = (),
     ) -> None:
         self.config, self.l1, self.seed = config, l1, seed
         self.device = resolve_device(device)
@@ -186,6 +203,18 @@ class Algorithm(ABC):
         model = vars(config.model)
         self.dynamics = make_dynamics(self.task.observation_dim, self.task.action_dim, **model)
         self.dynamics.to(self.device)
+        self.outcomes = Outcomes(
+            self.task,
+            reward,
+            termination,
+            outcome_model,
+            config.fit,
+            std_floor=config.model.std_floor,
+            margin=config.model.box_margin,
+            seed=seed,
+            device=self.device,
+            search_path=search_path,
+        )
         on_cpu = self.device.type == "cpu"
         self.acting_dynamics = self.dynamics if on_cpu else deepcopy(self.dynamics).cpu()
         self.real = partial(
@@ -196,6 +225,12 @@ class Algorithm(ABC):
             perturbation=perturbation or Perturbation(),
             compile_l1=compile_l1,
         )
+
+    def make_learning(self, capacity: int) -> ModelLearning:
+        """Data with room for so many real transitions, and the fits of the model to them."""
+        fit, label = self.config.fit, self.config.label
+        terminations = self.outcomes.learns_terminations
+        return ModelLearning(self.dynamics, fit, label, capacity, terminations)
 
     @abstractmethod
     def iterate(self) -> Iterator[IterationResult]:
@@ -245,7 +280,19 @@ class Algorithm(ABC):
             self._check_weights("model", self.dynamics)
             self.acting_dynamics.load_state_dict(self.dynamics.state_dict())
             self._calibrate_filter()
-        return fit_metrics(report)
+            learned = self._fit_outcomes()
+        return {**fit_metrics(report), **learned}
+
+    def _fit_outcomes(self) -> dict[str, float]:
+        """Fit what is learned of rewards and terminations, to the same data as the model."""
+        if not self.outcomes.models:
+            return {}
+        self.on_phase(f"fit, {' and '.join(self.outcomes.models).replace('_model', '')}")
+        metrics = self.outcomes.fit(self.learning.buffer, self.learning.action_key, self.iteration)
+        self._check_finite(metrics)
+        for name, model in self.outcomes.models.items():
+            self._check_weights(name.replace("_", " "), model)
+        return metrics
 
     def _calibrate_filter(self) -> None:
         """Where a Kalman filter acts, fit it to what the model misses now."""
@@ -277,7 +324,8 @@ class Algorithm(ABC):
         error = Diverged(self.iteration, self._phase, what, setting)
         if self.stops_on_divergence:
             raise error
-        if str(error) not in map(str, self._diverged):
+        # What a phase has noted need not be said again at the end of the iteration.
+        if not any(f": {what}; " in str(noted) for noted in self._diverged):
             self._diverged.append(error)
 
     def _check_finite(self, metrics: Mapping[str, float]) -> None:
@@ -323,14 +371,17 @@ class Algorithm(ABC):
 
     def weights(self) -> dict[str, dict[str, Any]]:
         """State dicts of what has been learned, by the names under which users look for them."""
-        return {"model": self.dynamics.state_dict()}
+        return {"model": self.dynamics.state_dict(), **self.outcomes.weights()}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue, as plain tensors and numbers."""
-        return {"iteration": self.iteration, **self.learning.state_dict()}
+        state = {"iteration": self.iteration, **self.learning.state_dict()}
+        learned = self.outcomes.state_dict()
+        return {**state, "outcomes": learned} if learned else state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
         self.iteration = state["iteration"]
         self.learning.load_state_dict(state)
+        self.outcomes.load_state_dict(state.get("outcomes", {}))
         self.acting_dynamics.load_state_dict(self.dynamics.state_dict())

@@ -70,12 +70,16 @@ class Cloning:
     Args:
         policy: changed in place.
         config: how it is fitted.
-        half_range: half the range of the actions.
+        half_range: half the range of the actions, one number or one for each entry.
         capacity: states that there is room for.
     """
 
     def __init__(
-        self, policy: GaussianPolicy, config: CloningSettings, half_range: float, capacity: int
+        self,
+        policy: GaussianPolicy,
+        config: CloningSettings,
+        half_range: float | Tensor,
+        capacity: int,
     ) -> None:
         self.policy, self.config, self.half_range = policy, config, half_range
         self.data = TrainingData(capacity, config.batch_size, config.validation_fraction)

@@ -19,7 +19,7 @@ from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_ty
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config, L1Transform, OracleTransform
 from torchrl_l1.dynamics import EnsembleDynamics
-from torchrl_l1.envs import Perturbation, Task, make_env
+from torchrl_l1.envs import AnyTask, Perturbation, make_env
 
 RETURN_METRICS: dict[str, str] = {
     "return_mean": "Mean return of full real episodes, with L1 if it is on.",
@@ -65,7 +65,7 @@ ORACLE: Literal["oracle"] = "oracle"
 
 
 def make_pipeline(
-    task: Task,
+    task: AnyTask,
     num_envs: int,
     perturbation: Perturbation,
     dynamics: EnsembleDynamics,
@@ -103,7 +103,7 @@ class Collection:
 
     def __init__(
         self,
-        task: Task,
+        task: AnyTask,
         episodes: int,
         policy: TensorDictModuleBase,
         dynamics: EnsembleDynamics,
@@ -148,13 +148,13 @@ class Collection:
         )
         return iter(collector)
 
-    def random(self, seed: int, bounds: tuple[float, float] | None = None) -> TensorDictBase:
+    def random(self, seed: int, bounds: tuple[Tensor, Tensor] | None = None) -> TensorDictBase:
         """Episodes ``[N, T]`` of actions uniform between ``bounds``; those of the task if none."""
         env = self._bare_env()
         spec = env.full_action_spec
         if bounds is not None:
-            shape = env.action_spec.shape
-            spec = Composite(action=Bounded(*bounds, shape=shape, dtype=torch.float32))
+            low, high = (bound.expand(env.action_spec.shape) for bound in bounds)
+            spec = Composite(action=Bounded(low, high, low.shape, dtype=torch.float32))
         batches = self._batches(env, RandomPolicy(spec))
         _seed(env, seed, "random")
         return _with_executed(next(batches))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+from torchrl_l1.algorithms.outcomes import Outcomes
 from torchrl_l1.checks import (
     check_choice,
     check_counts,
@@ -14,7 +15,7 @@ from torchrl_l1.checks import (
 )
 from torchrl_l1.dynamics import HEADS, MODEL_FORMS, EnsembleDynamics
 from torchrl_l1.dynamics.ensemble import ACTIVATIONS
-from torchrl_l1.envs import Task
+from torchrl_l1.envs import AnyTask
 from torchrl_l1.planning import TrajectorySampler, check_sampling, resolve_compilation
 
 
@@ -29,20 +30,27 @@ class PlanSettings(Protocol):
 
 
 def make_sampler(
-    settings: PlanSettings, dynamics: EnsembleDynamics, task: Task, **more: Any
+    settings: PlanSettings,
+    dynamics: EnsembleDynamics,
+    task: AnyTask,
+    outcomes: Outcomes,
+    **more: Any,
 ) -> TrajectorySampler:
     """What values plans on a task, as an algorithm's settings say.
 
     Args:
         settings: those of the algorithm.
         dynamics: the model.
-        task: for reward and termination.
+        task: whose termination is the built-in one.
+        outcomes: for reward and termination.
         **more: what only some algorithms set of :class:`~torchrl_l1.planning.TrajectorySampler`.
     """
     return TrajectorySampler(
         dynamics,
-        task.imagined_reward,
-        task.terminated if task.terminates else None,
+        outcomes.reward,
+        outcomes.terminated(
+            task.terminated if outcomes.own_termination and task.terminates else None
+        ),
         settings.particles,
         settings.propagation,  # type: ignore[arg-type]
         settings.precision,  # type: ignore[arg-type]

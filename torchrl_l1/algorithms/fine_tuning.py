@@ -16,7 +16,7 @@ from torchrl.objectives.value import GAE
 from torchrl_l1.algorithms.mbmf_config import FineTuningConfig
 from torchrl_l1.algorithms.policy import GaussianPolicy, make_actor
 from torchrl_l1.dynamics import Normalizer
-from torchrl_l1.envs import Task
+from torchrl_l1.envs import AnyTask, action_bounds
 
 _SAMPLED = "sampled"
 _LOG_PROB = "sampled_log_prob"
@@ -175,13 +175,13 @@ class _Value(nn.Module):
         return value
 
 
-def exploring(policy: GaussianPolicy, task: Task) -> TensorDictModuleBase:
+def exploring(policy: GaussianPolicy, task: AnyTask) -> TensorDictModuleBase:
     """What collects for :class:`FineTuning`: ``action`` is clipped to the task's bounds.
 
     The action before clipping, and the logarithm of its density, are kept beside it: the
     likelihood ratios of PPO are of what the policy has drawn.
     """
-    low, high = (torch.full((task.action_dim,), b) for b in (task.action_low, task.action_high))
+    low, high = action_bounds(task)
     clip = TensorDictModule(
         lambda sampled: sampled.clamp(low, high), in_keys=[_SAMPLED], out_keys=["action"]
     )

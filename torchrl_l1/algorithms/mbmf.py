@@ -35,10 +35,9 @@ from torchrl_l1.algorithms.config import episode_length, make_sampler
 from torchrl_l1.algorithms.facts import AlgorithmFacts, Phase
 from torchrl_l1.algorithms.fine_tuning import FINE_TUNING_METRICS, FineTuning, exploring
 from torchrl_l1.algorithms.mbmf_config import STAGES, MBMFConfig
-from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.policy import GaussianPolicy, acting
 from torchrl_l1.control import L1Config
-from torchrl_l1.envs import Perturbation
+from torchrl_l1.envs import AnyTask, Perturbation, action_bounds
 from torchrl_l1.planning import ModelPredictiveController, ShootingConfig
 
 
@@ -46,7 +45,7 @@ class MBMF(Algorithm):
     """The algorithm and its state; :meth:`iterate` is the loop.
 
     Args:
-        task: name of a task, see :data:`torchrl_l1.envs.TASKS`.
+        task: a task, or its name, see :func:`torchrl_l1.envs.get_task`.
         config: settings.
         l1: the adaptive controller around the planner; ``None`` for none.
         perturbation: noise and disturbances of the real environments.
@@ -99,7 +98,7 @@ class MBMF(Algorithm):
 
     def __init__(
         self,
-        task: str,
+        task: str | AnyTask,
         config: MBMFConfig,
         l1: L1Config | None = None,
         perturbation: Perturbation | None = None,
@@ -120,8 +119,9 @@ class MBMF(Algorithm):
         )
         collected *= self.episode_steps
         capacity = self.start.frames + collected
-        self.learning = ModelLearning(self.dynamics, config.fit, config.label, capacity)
-        half = (self.task.action_high - self.task.action_low) / 2
+        self.learning = self.make_learning(capacity)
+        low, high = action_bounds(self.task)
+        half = (high - low) / 2
         self.cloning = Cloning(self.clone, config.cloning, half, collected)
 
     def _open_environments(self) -> None:
@@ -232,15 +232,18 @@ class MBMF(Algorithm):
 
     def _planner(self, shooting: ShootingConfig) -> ModelPredictiveController:
         config = self.config
-        sampler = make_sampler(config, self.dynamics, self.task, discount=config.plan_discount)
+        sampler = make_sampler(
+            config, self.dynamics, self.task, self.outcomes, discount=config.plan_discount
+        )
         return ModelPredictiveController(
             sampler, shooting, *self._bounds(), replan_every=config.replan_every
         )
 
-    def _bounds(self) -> tuple[float, float]:
-        """Bounds of random and planned actions."""
+    def _bounds(self) -> tuple[Tensor, Tensor]:
+        """Bounds of random and planned actions ``(m,)``."""
         own = math.inf if self.config.action_bound is None else self.config.action_bound
-        return max(self.task.action_low, -own), min(self.task.action_high, own)
+        low, high = action_bounds(self.task)
+        return low.clamp(min=-own), high.clamp(max=own)
 
     @property
     def policies(self) -> Mapping[str, TensorDictModuleBase]:

@@ -24,7 +24,6 @@ from torchrl_l1.algorithms.algorithm import (
 from torchrl_l1.algorithms.collection import L1_METRICS, policy_returns, signal_metrics
 from torchrl_l1.algorithms.facts import AlgorithmFacts, Phase, Stage
 from torchrl_l1.algorithms.metrpo_config import METRPOConfig, check_clipping
-from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.policy import GaussianPolicy, acting
 from torchrl_l1.algorithms.policy_improvement import (
     POLICY_METRICS,
@@ -33,14 +32,14 @@ from torchrl_l1.algorithms.policy_improvement import (
 )
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics.network import model_precision
-from torchrl_l1.envs import Perturbation
+from torchrl_l1.envs import AnyTask, Perturbation
 
 
 class METRPO(Algorithm):
     """The algorithm and its state; :meth:`iterate` is the loop.
 
     Args:
-        task: name of a task, see :data:`torchrl_l1.envs.TASKS`.
+        task: a task, or its name, see :func:`torchrl_l1.envs.get_task`.
         config: settings.
         l1: the adaptive controller used in collection; ``None`` for none.
         perturbation: noise and disturbances of the real environments.
@@ -83,7 +82,7 @@ class METRPO(Algorithm):
 
     def __init__(
         self,
-        task: str,
+        task: str | AnyTask,
         config: METRPOConfig,
         l1: L1Config | None = None,
         perturbation: Perturbation | None = None,
@@ -93,14 +92,16 @@ class METRPO(Algorithm):
         super().__init__(task, config, l1, perturbation, **surroundings)
         n, m = self.task.observation_dim, self.task.action_dim
         self.policy = GaussianPolicy(n, m, config.policy.hidden, config.policy.std).to(self.device)
-        self.improvement = PolicyImprovement(self.task, self.dynamics, self.policy, config)
+        self.improvement = PolicyImprovement(
+            self.task, self.dynamics, self.policy, config, self.outcomes
+        )
         on_cpu = self.device.type == "cpu"
         self.acting_policy = self.policy if on_cpu else deepcopy(self.policy).cpu()
         real = partial(self.real, policy=acting(self.acting_policy, self.task, config.clip_actions))
         self.collection = real(episodes=config.episodes_per_iteration, horizon=self.episode_steps)
         self.evaluation = real(episodes=config.evaluation_episodes, horizon=self.horizon)
         capacity = (config.outer_iterations + 1) * self.collection.frames
-        self.learning = ModelLearning(self.dynamics, config.fit, config.label, capacity)
+        self.learning = self.make_learning(capacity)
 
     def iterate(self) -> Iterator[IterationResult]:
         """Run the outer iterations that are left, reporting after each."""
@@ -108,7 +109,9 @@ class METRPO(Algorithm):
         for iteration in self.rounds():
             if len(self.learning.buffer) == 0:
                 with self.phase("random"):
-                    self.learning.store(self.collection.random(self.seed))
+                    data = self.collection.random(self.seed)
+                    self.learning.store(data)
+                    self.improvement.see(data)
 
             fit = self.fit()
 
@@ -124,12 +127,15 @@ class METRPO(Algorithm):
                         steps.append(self.improvement.step(self.learning.buffer))
                     except ValueError as error:
                         self.diverged(str(error), "imagined_horizon, discount and policy.std")
+                improvement = policy_metrics(steps)
+                self._check_finite(improvement)
                 self._check_weights("policy", self.policy)
 
             with self.phase("collect"):
                 self.acting_policy.load_state_dict(self.policy.state_dict())
                 data = self.collection.collect(self.seed, iteration)
                 self.learning.store(data)
+                self.improvement.see(data)
 
             with self.phase("evaluate"):
                 returns = policy_returns(
@@ -140,7 +146,7 @@ class METRPO(Algorithm):
                 **returns,
                 **signal_metrics(data),
                 **fit,
-                **policy_metrics(steps),
+                **improvement,
                 "policy/std": self.policy.log_std.detach().exp().mean().item(),
             }
             yield self.complete((iteration + 2) * self.collection.frames, metrics)

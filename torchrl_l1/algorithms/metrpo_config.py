@@ -60,7 +60,8 @@ class METRPOConfig:
         imagined_from_data: share of the imagined trajectories that start from states in the
             real data; the others start as the task does. Where the imagined horizon is shorter
             than the task's, later states are never imagined otherwise.
-        imagined_termination: whether imagined trajectories end where the task's episodes do. In the
+        imagined_termination: whether imagined trajectories end where the task's episodes do, with
+            the recipe's ``termination=builtin``; any other ``termination`` has its own way. In the
             published code they do not: a walker that fell goes on, on the ground.
         box_exit: what an imagined trajectory that leaves the box around the data is worth from
             there on: nothing (``fail``, the paper's MDP), or what the baseline says of its last

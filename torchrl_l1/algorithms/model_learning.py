@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, FitReport, fit_ensemble
@@ -64,10 +65,16 @@ class ModelLearning:
         label: ``nominal`` fits it to the policy's action, ``executed`` to what L1 sent to the
             actuators.
         capacity: real transitions that there is room for.
+        terminations: whether to keep which transitions terminated an episode.
     """
 
     def __init__(
-        self, dynamics: EnsembleDynamics, config: FitConfig, label: str, capacity: int
+        self,
+        dynamics: EnsembleDynamics,
+        config: FitConfig,
+        label: str,
+        capacity: int,
+        terminations: bool = False,
     ) -> None:
         self.dynamics, self.config = dynamics, config
         self.action_key = "action" if label == "nominal" else "executed"
@@ -76,6 +83,9 @@ class ModelLearning:
         )
         self.data = TrainingData(capacity, config.batch_size, config.validation_fraction)
         self.buffer = self.data.buffer
+        self._kept: list[NestedKey] = ["observation", "action", "executed"]
+        self._kept += [("next", "observation"), ("next", "reward")]
+        self._kept += [("next", "terminated")] * terminations
 
     def reserve(self, capacity: int) -> None:
         """Forget all transitions, and make room for so many."""
@@ -87,11 +97,7 @@ class ModelLearning:
         """Add real transitions ``[N, T]``, a fixed share of them marked for validation."""
         flat = data.reshape(-1)
         flat = flat[~flat["next", "non_finite"].squeeze(-1)]
-        self.data.extend(
-            flat.select(
-                "observation", "action", "executed", ("next", "observation"), ("next", "reward")
-            )
-        )
+        self.data.extend(flat.select(*self._kept))
 
     def fit(self, on_epoch: Callable[[int], None] | None = None) -> FitReport:
         """Fit the model to all data, from the weights that it has."""

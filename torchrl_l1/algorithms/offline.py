@@ -35,6 +35,7 @@ from torchrl_l1.algorithms.collection import (
 from torchrl_l1.algorithms.facts import AlgorithmFacts, Phase, Stage
 from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.offline_config import OfflineConfig
+from torchrl_l1.algorithms.outcomes import OUTCOME_METRICS
 from torchrl_l1.algorithms.pessimism import PENALTY_METRICS, Pessimism
 from torchrl_l1.algorithms.policy import GaussianPolicy, acting
 from torchrl_l1.algorithms.policy_improvement import (
@@ -45,7 +46,7 @@ from torchrl_l1.algorithms.policy_improvement import (
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import read_transitions
 from torchrl_l1.dynamics.network import model_precision
-from torchrl_l1.envs import Perturbation
+from torchrl_l1.envs import AnyTask, Perturbation, action_bounds
 
 OFFLINE_METRICS: dict[str, str] = {
     "data/transitions": "Transitions of the dataset.",
@@ -64,8 +65,8 @@ class Offline(Algorithm):
     """The algorithm and its state; :meth:`iterate` is the loop.
 
     Args:
-        task: name of a task, see :data:`torchrl_l1.envs.TASKS`: its rewards and its bounds count,
-            and the real system that policies are measured on is of it.
+        task: a task, or its name, see :func:`torchrl_l1.envs.get_task`: its rewards and its bounds
+            count, and the real system that policies are measured on is of it.
         config: settings.
         l1: the adaptive controller used in measurements; ``None`` for none.
         perturbation: noise and disturbances of the real environments.
@@ -73,6 +74,9 @@ class Offline(Algorithm):
             :func:`~torchrl_l1.dynamics.read_transitions`, or a function that reads them. Those of
             ``executed`` actions count where there are any and ``config.label`` says so.
         **surroundings: see :class:`~torchrl_l1.algorithms.Algorithm`.
+
+    Raises:
+        ValueError: if a reward or a termination is to be learned.
 
     Attributes:
         pessimism: what imagined trajectories pay for the model's uncertainty.
@@ -101,7 +105,9 @@ class Offline(Algorithm):
             "evaluate": Phase("evaluating", "measuring returns"),
         },
         metrics={
-            **COMMON_METRICS,
+            **{
+                name: words for name, words in COMMON_METRICS.items() if name not in OUTCOME_METRICS
+            },
             "real_steps": "Transitions of the dataset; those of measurements do not count.",
             "return_mean": "Mean return of `evaluation_episodes` real episodes with sampled "
             "actions, with L1 if it is on. Nothing is learned from them.",
@@ -121,7 +127,7 @@ class Offline(Algorithm):
 
     def __init__(
         self,
-        task: str,
+        task: str | AnyTask,
         config: OfflineConfig,
         l1: L1Config | None = None,
         perturbation: Perturbation | None = None,
@@ -130,16 +136,17 @@ class Offline(Algorithm):
         **surroundings: Unpack[Surroundings],
     ) -> None:
         super().__init__(task, config, l1, perturbation, **surroundings)
+        if self.outcomes.models:
+            raise ValueError(
+                f"{' and '.join(self.outcomes.models)}: offline learning goes by rewards and "
+                "terminations that are known; choose builtin or MODULE:FUNCTION instead of learned"
+            )
         self.data = data
         n, m = self.task.observation_dim, self.task.action_dim
         self.policy = GaussianPolicy(n, m, config.policy.hidden, config.policy.std).to(self.device)
-        bounds = (
-            torch.full((m,), bound, device=self.device)
-            for bound in (self.task.action_low, self.task.action_high)
-        )
-        self.pessimism = Pessimism(self.dynamics, config, *bounds)
+        self.pessimism = Pessimism(self.dynamics, config, *action_bounds(self.task, self.device))
         self.improvement = PolicyImprovement(
-            self.task, self.dynamics, self.policy, config, self.pessimism
+            self.task, self.dynamics, self.policy, config, self.outcomes, self.pessimism
         )
         on_cpu = self.device.type == "cpu"
         self.acting_policy = self.policy if on_cpu else deepcopy(self.policy).cpu()
@@ -184,7 +191,7 @@ class Offline(Algorithm):
                 "executed": action,
                 "next": {
                     "observation": following,
-                    "reward": self.task.imagined_reward(observation, action, following)[:, None],
+                    "reward": self.outcomes.reward(observation, action, following)[:, None],
                     "non_finite": torch.zeros(rows, 1, dtype=torch.bool),
                 },
             },
@@ -271,8 +278,8 @@ class Offline(Algorithm):
                 self.policy.normalizer.fit(data["observation"].to(self.device))
             if not config.enabled:
                 return {"clone/validation_loss": 0.0}
-            half_range = (self.task.action_high - self.task.action_low) / 2
-            cloning = Cloning(self.policy, config, half_range, len(data))
+            low, high = action_bounds(self.task)
+            cloning = Cloning(self.policy, config, (high - low) / 2, len(data))
             cloning.store(data["observation"], data["action"])
             report = cloning.fit(lambda epoch: self.on_phase(f"cloning, epoch {epoch}"))
             self._check_weights("policy", self.policy)

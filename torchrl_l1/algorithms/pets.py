@@ -25,10 +25,9 @@ from torchrl_l1.algorithms.algorithm import (
 from torchrl_l1.algorithms.collection import L1_METRICS, returns_of_one_way, signal_metrics
 from torchrl_l1.algorithms.config import episode_length, make_sampler
 from torchrl_l1.algorithms.facts import AlgorithmFacts, Phase, Stage, Variant
-from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.pets_config import PETSConfig
 from torchrl_l1.control import L1Config
-from torchrl_l1.envs import Perturbation
+from torchrl_l1.envs import AnyTask, Perturbation
 from torchrl_l1.planning import ModelPredictiveController
 
 
@@ -36,7 +35,7 @@ class PETS(Algorithm):
     """The algorithm and its state; :meth:`iterate` is the loop.
 
     Args:
-        task: name of a task, see :data:`torchrl_l1.envs.TASKS`.
+        task: a task, or its name, see :func:`torchrl_l1.envs.get_task`.
         config: settings.
         l1: the adaptive controller used in collection; ``None`` for none.
         perturbation: noise and disturbances of the real environments.
@@ -72,7 +71,7 @@ class PETS(Algorithm):
 
     def __init__(
         self,
-        task: str,
+        task: str | AnyTask,
         config: PETSConfig,
         l1: L1Config | None = None,
         perturbation: Perturbation | None = None,
@@ -80,7 +79,13 @@ class PETS(Algorithm):
     ) -> None:
         super().__init__(task, config, l1, perturbation, **surroundings)
         self.policy = ModelPredictiveController(
-            make_sampler(config, self.dynamics, self.task, common_noise=config.common_noise),
+            make_sampler(
+                config,
+                self.dynamics,
+                self.task,
+                self.outcomes,
+                common_noise=config.common_noise,
+            ),
             config.cem,
             self.task.action_low,
             self.task.action_high,
@@ -92,7 +97,7 @@ class PETS(Algorithm):
         self.collection = real(episodes=config.episodes_per_iteration, horizon=self.episode_steps)
         self.evaluation = real(episodes=max(config.evaluation_episodes, 1), horizon=self.horizon)
         capacity = self.start.frames + config.outer_iterations * self.collection.frames
-        self.learning = ModelLearning(self.dynamics, config.fit, config.label, capacity)
+        self.learning = self.make_learning(capacity)
         self.fit_report: dict[str, float] = {}
 
     def iterate(self) -> Iterator[IterationResult]:

@@ -20,7 +20,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from torchrl_l1.algorithms.facts import KINDS
 from torchrl_l1.dynamics import Normalizer
-from torchrl_l1.envs import Task
+from torchrl_l1.envs import AnyTask, action_bounds
 from torchrl_l1.objectives import is_tanh_network
 
 _MEAN = (ExplorationType.DETERMINISTIC, ExplorationType.MEAN, ExplorationType.MODE)
@@ -138,7 +138,7 @@ class GaussianActor(ProbabilisticActor):
         policy: GaussianPolicy,
         action_key: str = "action",
         log_prob_key: str | None = None,
-        bounds: tuple[float, float] | None = None,
+        bounds: tuple[float, float] | tuple[Tensor, Tensor] | None = None,
     ) -> None:
         super().__init__(
             TensorDictModule(policy, in_keys=["observation"], out_keys=["loc", "scale"]),
@@ -192,7 +192,7 @@ def make_actor(
     return GaussianActor(policy, action_key, log_prob_key)
 
 
-def acting(policy: GaussianPolicy, task: Task, clip: bool = True) -> TensorDictModuleBase:
+def acting(policy: GaussianPolicy, task: AnyTask, clip: bool = True) -> TensorDictModuleBase:
     """What acts on the real system: the policy's actor, its actions clipped to the task's bounds.
 
     Both arms of a comparison, with and without L1, act and store clipped actions.
@@ -202,7 +202,12 @@ def acting(policy: GaussianPolicy, task: Task, clip: bool = True) -> TensorDictM
         task: for the bounds.
         clip: whether to clip.
     """
-    return GaussianActor(policy, bounds=(task.action_low, task.action_high) if clip else None)
+    low, high = task.action_low, task.action_high
+    if not clip:
+        return GaussianActor(policy)
+    if isinstance(low, tuple) or isinstance(high, tuple):
+        return GaussianActor(policy, bounds=action_bounds(task))
+    return GaussianActor(policy, bounds=(low, high))
 
 
 def kinds_of(policy: TensorDictModuleBase) -> tuple[str, ...]:

@@ -14,9 +14,10 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
+from torchrl_l1.algorithms.outcomes import Outcomes
 from torchrl_l1.algorithms.policy import GaussianPolicy, make_actor
 from torchrl_l1.dynamics import EnsembleDynamics, imagine
-from torchrl_l1.envs import StartStates, Task
+from torchrl_l1.envs import AnyTask, StartStates, Task, action_bounds
 from torchrl_l1.objectives import (
     LinearFeatureBaseline,
     TRPOConfig,
@@ -61,34 +62,74 @@ class PolicyStep:
     left_box: float
 
 
+class SeenStarts:
+    """Start states of a task that cannot be reset without stepping it: those seen so far.
+
+    Attributes:
+        observations: first observations of real episodes ``(K, n)``, float32, as L1 and policies
+            saw them.
+
+    Examples:
+        >>> starts = SeenStarts()
+        >>> done = torch.tensor([[[False], [True], [False]]])
+        >>> observation = torch.arange(3.0).reshape(1, 3, 1)
+        >>> starts.see(TensorDict({"observation": observation, "next": {"done": done}}, [1, 3]))
+        >>> starts.observations.tolist()
+        [[0.0], [2.0]]
+    """
+
+    def __init__(self) -> None:
+        self.observations = torch.zeros(0, 0)
+
+    def see(self, data: TensorDictBase) -> None:
+        """Remember those of episodes ``[N, T]``."""
+        done, observation = data["next", "done"].squeeze(-1), data["observation"].float()
+        first = torch.ones_like(done)
+        first[:, 1:] = done[:, :-1]
+        fresh = observation[first]
+        known = self.observations if len(self.observations) else fresh[:0]
+        self.observations = torch.cat([known, fresh])
+
+    def __call__(self, count: int) -> Tensor:
+        """Some of them ``(count, n)``, drawn with torch's global generator."""
+        if not count:
+            return torch.zeros(0)
+        return self.observations[torch.randint(len(self.observations), (count,))]
+
+
 class PolicyImprovement:
     """TRPO steps of a policy in a learned model (arXiv 1802.10592).
 
     Args:
-        task: rewards, start states and action bounds.
+        task: start states and action bounds.
         dynamics: the model.
         policy: changed in place, on the model's device.
         config: settings.
+        outcomes: rewards and ends of what is imagined.
         penalize: changes the imagined trajectories before anything is learned from them.
     """
 
     def __init__(
         self,
-        task: Task,
+        task: AnyTask,
         dynamics: EnsembleDynamics,
         policy: GaussianPolicy,
         config: ImprovementConfig,
+        outcomes: Outcomes,
         penalize: Callable[[TensorDict], TensorDict] | None = None,
     ) -> None:
         self.penalize = penalize
         self.task, self.dynamics, self.policy, self.config = task, dynamics, policy, config
+        self.outcomes = outcomes
         self.device = next(policy.parameters()).device
         self.baseline = LinearFeatureBaseline(task.observation_dim).to(self.device)
-        self.start_states = StartStates(task)
-        self.action_low, self.action_high = (
-            torch.full((task.action_dim,), bound, device=self.device)
-            for bound in (task.action_low, task.action_high)
-        )
+        self.start_states = StartStates(task) if isinstance(task, Task) else SeenStarts()
+        self.action_low, self.action_high = action_bounds(task, self.device)
+
+    def see(self, data: TensorDictBase) -> None:
+        """Remember how episodes ``[N, T]`` started, where the task does not tell how they do."""
+        if isinstance(self.start_states, SeenStarts):
+            self.start_states.see(data)
 
     def step(self, buffer: ReplayBuffer) -> PolicyStep:
         """One TRPO step on fresh imagined trajectories; the baseline is refitted after it."""
@@ -96,12 +137,12 @@ class PolicyImprovement:
         trajectories = imagine(
             self.dynamics,
             self.policy.sampler(),
-            self.task.imagined_reward,
+            self.outcomes.reward,
             self.starts(config.imagined_steps // config.imagined_horizon, buffer),
             config.imagined_horizon,
             self.action_low,
             self.action_high,
-            self.task.terminated if config.imagined_termination else None,
+            self.outcomes.terminated(self._own_termination()),
             precision=config.precision,  # type: ignore[arg-type]
         )
         if self.penalize is not None:
@@ -129,6 +170,10 @@ class PolicyImprovement:
             left_box=trajectories["next", "left_box"].any(1).float().mean().item(),
         )
 
+    def _own_termination(self) -> Callable[[Tensor], Tensor] | None:
+        own = self.config.imagined_termination and self.outcomes.own_termination
+        return self.task.terminated if own else None
+
     def _improve(self, observation: Tensor, action: Tensor, advantage: Tensor) -> TRPOReport:
         policy, config = self.policy, self.config.trpo
         if policy.is_plain:
@@ -151,10 +196,15 @@ class PolicyImprovement:
 
     def state_dict(self) -> dict[str, Any]:
         """What a step leaves behind beside the policy."""
-        return self.baseline.state_dict()
+        state = self.baseline.state_dict()
+        if isinstance(self.start_states, SeenStarts):
+            return {"baseline": state, "starts": self.start_states.observations}
+        return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
+        if isinstance(self.start_states, SeenStarts):
+            self.start_states.observations, state = state["starts"], state["baseline"]
         self.baseline.load_state_dict(state)
 
 

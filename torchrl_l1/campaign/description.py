@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import yaml  # type: ignore[import-untyped]
 
-from torchrl_l1.experiment.files import problem, yaml_text
+from torchrl_l1.experiment.files import path_text, problem, yaml_text
 from torchrl_l1.experiment.matrix import (
     SUITE_L1,
     Axis,
@@ -89,6 +89,9 @@ def dump_yaml(content: Any) -> str:
 
 # What may become part of a path and of a Hydra override without quotes.
 _PLAIN = re.compile(r"[A-Za-z0-9_.+-]{1,100}")
+# Names of environments and functions; in a path, underscores stand for what separates folders.
+_NAME_OF_CODE = re.compile(r"[A-Za-z0-9_.+:/-]{1,200}")
+_NAMING = ("task", "reward", "termination")
 # Keys too; a group may be below another one.
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:[./@-][A-Za-z0-9_]+)*")
 # Of a campaign, whose default is that of a user's file.
@@ -124,12 +127,12 @@ class RunMatrix:
             _check_list(f"matrix.{key}", values, (str, int, float), filled=True)
             texts = [value_text(value) for value in values]
             for text in texts:
-                if not _PLAIN.fullmatch(text):
+                if not (_NAME_OF_CODE if key in _NAMING else _PLAIN).fullmatch(text):
                     raise CampaignError(
                         f"matrix.{key}: {text!r} cannot name a folder; give a word or a number, "
                         "and move what all runs share to overrides"
                     )
-            if len(set(texts)) < len(texts):
+            if len(set(map(path_text, texts))) < len(texts):
                 raise CampaignError(f"matrix.{key} names a value twice: {', '.join(texts)}")
         for key in [*self.matrix, *map(override_key, self.overrides)]:
             if key in _RESERVED:
@@ -157,7 +160,7 @@ class EvaluationSettings:
         episodes: episodes per cell.
         seed: seed of resets, noise and sampled actions.
         suite: name of a suite of disturbances, in place of values of them. With it, ``l1`` is
-            ``[off, paper, oracle]`` if it is not given.
+            ``[off, paper, robust, oracle]`` if it is not given.
     """
 
     name: str

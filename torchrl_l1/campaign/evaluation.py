@@ -11,6 +11,7 @@ from torchrl_l1.experiment.evaluate import distinct, episodes_file, evaluate_epi
 from torchrl_l1.experiment.files import refuse_link, write_atomically, write_table
 from torchrl_l1.experiment.matrix import suite
 from torchrl_l1.experiment.run_directory import RunDirectory
+from torchrl_l1.experiment.tracking import Evaluated, log_evaluation
 
 
 def evaluation_file(run_dir: Path, name: str) -> Path:
@@ -83,5 +84,7 @@ def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
     described.unlink(missing_ok=True)
     write_table(singly, episodes)
     write_table(table, rows)
+    # Before its settings: what a kill comes between is made, and logged, again.
+    log_evaluation(trained.recipe, trained.path, Evaluated(f"evaluations/{name}", rows))
     write_atomically(described, dump_yaml(_described(chosen, trained.algorithm.iteration)))
     return table

@@ -14,6 +14,7 @@ from torchrl_l1.campaign.evaluation import is_evaluated
 from torchrl_l1.campaign.plan import PlannedRun, quoted, recipe_name
 from torchrl_l1.campaign.progress import Progress
 from torchrl_l1.campaign.workers import Failure, Job, Unfinished, Workers
+from torchrl_l1.experiment.files import path_text
 
 # Launcher: the module of the plug-in, and the extra that installs it. Hydra brings ``basic``.
 _PLUGINS = {
@@ -88,6 +89,9 @@ def sweep(
     """
     keys = [key for key in matrix.matrix if key != "seed"]
     parts = [f"${{hydra:overrides.task.{position}}}" for position in range(len(keys))]
+    for position, key in enumerate(keys):
+        if any(path_text(value_text(value)) != value_text(value) for value in matrix.matrix[key]):
+            parts[position] = f"${{path_text:{parts[position]}}}"
     run_dir = output.joinpath(recipe_name(matrix.recipe), *parts, "seed_${seed}")
     texts = {key: ",".join(map(value_text, values)) for key, values in matrix.matrix.items()}
     parallel = []

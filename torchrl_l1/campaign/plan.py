@@ -22,14 +22,16 @@ from torchrl_l1.campaign.description import (
     value_text,
 )
 from torchrl_l1.compilation import check_mode
-from torchrl_l1.envs import get_task
+from torchrl_l1.envs import AnyTask
 from torchrl_l1.experiment.errors import USER_ERRORS, RunDirectoryError, message
+from torchrl_l1.experiment.evaluate import check_plants
+from torchrl_l1.experiment.files import bounded, path_text
 from torchrl_l1.experiment.l1_options import check_tested
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import group_setting
-from torchrl_l1.experiment.run import check_wandb_mode
 from torchrl_l1.experiment.run_directory import RunDirectory
 from torchrl_l1.experiment.settings import SCHEMAS, RunSettings, check_known, l1_config
+from torchrl_l1.experiment.tracking import check_loggers
 
 
 @dataclass
@@ -64,13 +66,18 @@ class PlannedRun:
 
     def collected_steps(self, iterations: int) -> int:
         """Real steps that so many outer iterations collect; random data do not count."""
-        full = self.config.horizon or get_task(self.config.task).horizon
+        full = self.config.horizon or self.task.horizon
         steps = episode_length(self.config.get("episode_steps"), full)
         return self._recipe.collected_episodes(iterations) * steps
 
     def stages(self) -> tuple[str, ...]:
         """The stages that the run has reached once it is finished."""
         return self._recipe.stages()
+
+    @property
+    def task(self) -> AnyTask:
+        """What the run is about."""
+        return self._recipe.real_task()
 
     @cached_property
     def _recipe(self) -> RunSettings:
@@ -181,7 +188,7 @@ def _runs(index: int, matrix: RunMatrix, output: Path, trusted: bool) -> Iterato
     recipe = matrix.recipe
     for cell in cells(matrix):
         place = [f"{key}={text}" for key, text in cell.items()]
-        folder = output.joinpath(recipe_name(recipe), *place)
+        folder = output.joinpath(recipe_name(recipe), *map(path_text, place))
         overrides = [*matrix.overrides, *place, f"run_dir={quoted(folder)}"]
         config = compose(recipe, overrides, trusted=trusted)
         _check(config)
@@ -189,23 +196,20 @@ def _runs(index: int, matrix: RunMatrix, output: Path, trusted: bool) -> Iterato
             own = config.copy()
             own.seed = seed
             own.run_dir = str(folder / f"seed_{seed}")
-            yield PlannedRun(
-                {"recipe": recipe_name(recipe), **cell, "seed": str(seed)},
-                index,
-                round_,
-                RunDirectory(own.run_dir),
-                own,
-            )
+            values = {"recipe": recipe_name(recipe), **cell, "seed": str(seed)}
+            run = PlannedRun(values, index, round_, RunDirectory(own.run_dir), own)
+            if own.wandb.name is None:
+                own.wandb.name = bounded(str(run))
+            yield run
 
 
 def _check(config: DictConfig) -> None:
     check_known(config)
     recipe = OmegaConf.to_object(config)
     assert isinstance(recipe, RunSettings)
-    get_task(recipe.task)
-    l1_config(recipe.l1, recipe.task)
+    l1_config(recipe.l1, recipe.real_task())
     check_mode(recipe.l1.compile, "l1.compile")
-    check_wandb_mode(recipe.wandb.mode)
+    check_loggers(recipe)
 
 
 def check_devices(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
@@ -247,6 +251,10 @@ def _add_evaluations(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
             raise CampaignError(f"{place}: no run has all of where")
         for run in chosen:
             _check_stages(place, run, settings.matrix["stage"])
+            try:
+                check_plants(run.task, settings.conditions())
+            except ValueError as error:
+                raise CampaignError(f"{place}: {error}") from error
             if any(other.name == settings.name for other in run.evaluations):
                 raise CampaignError(
                     f"{place}: another evaluation of this name is for {run} too; give it another "

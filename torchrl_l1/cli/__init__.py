@@ -8,12 +8,25 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
+from torchrl_l1._version import __version__
+
 DESCRIPTION = "Robust model-based reinforcement learning with L1 adaptive control."
 
 _TRUST = "let the file set up Hydra itself, which may run any code"
 
 
-_DEPLOYMENT = (
+_LATER = (
+    (
+        "new-task",
+        "write a recipe for an environment of yours",
+        "Reads what an environment tells and writes a commented recipe for it.",
+    ),
+    (
+        "check",
+        "try a recipe's environment for a minute, and say what to fix",
+        "Specs, seeds, the effect of actions, reward and termination functions against the "
+        "environment, and one fit of the model.",
+    ),
     (
         "robustify",
         "put L1 around a policy of any origin, and test it under disturbances",
@@ -44,24 +57,35 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the console script. Exits with status 1 on a refused request."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser("torchrl-l1", description=DESCRIPTION)
+    parser.add_argument("--version", action="version", version=f"torchrl-l1 {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _run_parser(commands)
     _campaign_parser(commands)
     _evaluate_parser(commands, asked="evaluate" in arguments[:1])
-    for name, words, description in _DEPLOYMENT:
+    for name, words, description in _LATER:
         parts = commands.add_parser(name, help=words, description=description)
         # What their options come with is heavy; no other command should wait for it.
         if name in arguments[:1]:
-            import_module(f"torchrl_l1.cli.{name}").add_arguments(parts)
+            import_module(f"torchrl_l1.cli.{_module(name)}").add_arguments(parts)
     _report_parser(commands)
     verify = commands.add_parser(
         "verify", help="replay recorded traces of a reference controller in float64"
     )
     verify.add_argument("traces", help="an .npz file of recorded traces")
     verify.add_argument("--tolerance", type=float, default=1e-9, help="largest error allowed")
-    commands.add_parser("recipes", help="list the shipped recipes and campaigns")
+    recipes = commands.add_parser("recipes", help="list or copy the shipped recipes and campaigns")
+    recipes.add_argument(
+        "--copy",
+        nargs="+",
+        metavar=("NAME", "FILE"),
+        help="write a copy to edit: of a recipe or campaign, to NAME.yaml or a file of your choice",
+    )
 
-    options, rest = parser.parse_known_args(arguments)
+    try:
+        options, rest = parser.parse_known_args(arguments)
+    except SystemExit:
+        _flush(" ".join(arguments[:1]))  # the help that was asked for
+        raise
     overridden = options.command == "campaign" and not any(o.startswith("-") for o in rest)
     if rest and options.command != "run" and not overridden:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
@@ -70,6 +94,10 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     with orderly_end():
         _dispatch(options, rest)
+
+
+def _module(command: str) -> str:
+    return command.replace("-", "_")
 
 
 def _dispatch(options: argparse.Namespace, rest: list[str]) -> None:
@@ -86,9 +114,9 @@ def _dispatch(options: argparse.Namespace, rest: list[str]) -> None:
             from torchrl_l1.cli.evaluate import evaluate_command
 
             evaluate_command(options)
-        elif options.command in [name for name, *_ in _DEPLOYMENT]:
-            chosen = import_module(f"torchrl_l1.cli.{options.command}")
-            getattr(chosen, f"{options.command}_command")(options)
+        elif options.command in [name for name, *_ in _LATER]:
+            name = _module(options.command)
+            getattr(import_module(f"torchrl_l1.cli.{name}"), f"{name}_command")(options)
         elif options.command == "report":
             from torchrl_l1.report.build import report_command
 
@@ -99,17 +127,33 @@ def _dispatch(options: argparse.Namespace, rest: list[str]) -> None:
             if not verify_command(options.traces, options.tolerance):
                 sys.exit(1)
         else:
-            from torchrl_l1.experiment.recipes import available_campaigns, available_recipes
-
-            print("\n".join([*available_recipes(), "", "Campaigns:", *available_campaigns()]))
-        sys.stdout.flush()  # while a broken pipe can still be named
+            _recipes(options.copy)
+    except SystemExit:
+        _flush(options.command)
+        raise
     except USER_ERRORS as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
+        _flush(options.command)
         print(f"torchrl-l1 {options.command}: {message(error)}", file=sys.stderr)
-        if isinstance(error, BrokenPipeError):
-            # Nothing more can be written there, not even when the interpreter ends.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    _flush(options.command)
+
+
+def _flush(command: str) -> None:
+    """Write what is left of the output, while it can still be told that this fails.
+
+    Exits with status 1 if it does.
+    """
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        from torchrl_l1.experiment.errors import message
+
+        where = "" if isinstance(error, BrokenPipeError) else "standard output: "
+        print(f"torchrl-l1 {command}: {where}{message(error)}", file=sys.stderr)
+        # Nothing more can be written there, not even when the interpreter ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
 
 
@@ -180,6 +224,23 @@ def _report_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]
     add("dir", nargs="+", help="folders of runs, such as runs/campaigns/NAME")
     add("--output", help="folder of the results; DIR/report by default")
     add("--reference-curves", metavar="FILE", help="a CSV of the authors' curves to draw behind")
+
+
+def _recipes(copy: Sequence[str] | None) -> None:
+    from torchrl_l1.experiment.recipes import (
+        available_campaigns,
+        available_recipes,
+        copy_recipe,
+    )
+
+    if copy is None:
+        print("\n".join([*available_recipes(), "", "Campaigns:", *available_campaigns()]))
+        return
+    if len(copy) > 2:
+        raise ValueError(f"--copy takes a NAME and perhaps a FILE, got {' '.join(copy)}")
+    file = copy_recipe(*copy)
+    command = "campaign" if copy[0] in available_campaigns() else "run"
+    print(f"{file} is yours: torchrl-l1 {command} {file}")
 
 
 def _run(options: argparse.Namespace, overrides: list[str]) -> None:

@@ -12,13 +12,14 @@ import numpy as np
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from torchrl_l1.envs import DISTURBANCES
+from torchrl_l1.envs import DISTURBANCES, Task
 from torchrl_l1.envs.rendering import (
     RenderingUnavailable,
     animation,
     filmstrip,
     rollout_frames,
 )
+from torchrl_l1.experiment.checkpoints import CheckpointSettings
 from torchrl_l1.experiment.evaluate import (
     TrainedRun,
     distinct,
@@ -39,6 +40,7 @@ from torchrl_l1.experiment.matrix import (
 )
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.settings import RunSettings, WandbSettings
+from torchrl_l1.experiment.tracking import Evaluated, log_evaluation
 from torchrl_l1.report.evaluation_figures import RANGES, plot_disturbances
 from torchrl_l1.report.evaluation_summary import summarize, summary_tables
 from torchrl_l1.report.recovery import MEDIANS, SHARES, is_about_robustness, plot_heat_map
@@ -65,7 +67,12 @@ class _Suite(argparse.Action):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``torchrl-l1 evaluate``: one for all that it varies, and its own."""
     add = parser.add_argument
-    add("run_dir", nargs="+", help="one or more run directories")
+    add(
+        "run_dir",
+        nargs="+",
+        help="one or more run directories, or checkpoints that they keep, such as "
+        "RUN_DIR/checkpoints/best.pt",
+    )
     group = parser.add_argument_group("disturbances", "They vary one at a time, or as in a suite.")
     group.add_argument(
         "--suite",
@@ -100,14 +107,23 @@ def write_filmstrip(
     disturbance: str,
     seed: int,
     output: Path,
-) -> None:
+) -> list[Path]:
     """Render one deterministic episode per condition into ``filmstrip.png`` and ``.gif``.
 
     The conditions share the disturbance of that name; rows are named by their controllers, and by
     their stages where there are several. Where no headless OpenGL works, a line says so and nothing
     is written.
+
+    Returns:
+        what has been written.
     """
     task = trained.algorithm.task
+    if not isinstance(task, Task):
+        print(
+            f"No filmstrip: poses are drawn of tasks of ours, not of {task.name}; torchrl-l1 play "
+            f"{trained.path} --output film.gif shows an episode"
+        )
+        return
     several = len({cell.stage for cell in cells}) > 1
     steps = min(trained.recipe.horizon or task.horizon, round(_SECONDS_SHOWN / task.dt))
     try:
@@ -117,11 +133,12 @@ def write_filmstrip(
         }
     except RenderingUnavailable as error:
         print(f"No filmstrip: {error}")
-        return
+        return []
     strip = filmstrip(rows, output / "filmstrip.png", every=max(1, steps // _COLUMNS), dt=task.dt)
     moving = animation(rows, output / "rollout.gif", dt=task.dt)
     value = cells[0].disturbances[disturbance]
     print(f"Filmstrip at {disturbance} {value:g}: {strip}, animation: {moving}")
+    return [strip, moving]
 
 
 def _label(cell: Condition, several: bool) -> str:
@@ -150,9 +167,12 @@ def _check_one_study(runs: Sequence[TrainedRun]) -> None:
             trained.recipe,
             seed=0,
             run_dir="",
+            search_path=[],
             resume=False,
             wandb=WandbSettings(),
             on_divergence="stop",
+            loggers=[],
+            checkpoint=CheckpointSettings(),
         )
 
     for trained in runs[1:]:
@@ -217,7 +237,9 @@ def evaluate_command(options: argparse.Namespace) -> None:
     _check_one_study(runs)
     values["stage"] = _stages(runs, options.stage)
     cells = distinct(runs[0], conditions(options.suite, **values))
-    output = Path(options.output) if options.output else runs[0].path / "evaluation"
+    # A kept checkpoint has a folder of its own: its results are not the run's.
+    folder = "_".join(filter(None, ["evaluation", runs[0].checkpoint]))
+    output = Path(options.output) if options.output else runs[0].path / folder
     if not options.output:
         refuse_link(output)
     output.mkdir(parents=True, exist_ok=True)
@@ -238,8 +260,13 @@ def evaluate_command(options: argparse.Namespace) -> None:
     plots = _plots(summary, runs[0], output)
     print(f"Table: {', '.join(str(output / f'{name}.csv') for name in tables)}")
     print(f"Plot: {', '.join(map(str, plots))}")
+    pictures = plots
     if options.filmstrip:
         shown: dict[str, Any] = {name: [entry.neutral] for name, entry in DISTURBANCES.items()}
         name, worst = _worst(values)
         shown |= {name: [worst], "noise": ["none"], "policy": ["deterministic"]}
-        write_filmstrip(runs[0], conditions(**{**values, **shown}), name, options.seed, output)
+        cells = conditions(**{**values, **shown})
+        pictures = plots + write_filmstrip(runs[0], cells, name, options.seed, output)
+    for trained in runs:
+        own = [row for row in rows if row["run"] == trained.name]
+        log_evaluation(trained.recipe, trained.path, Evaluated(folder, own, pictures))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,17 @@ from torchrl_l1.checks import check_count
 from torchrl_l1.deployment import Assessment, RobustController, robustify
 from torchrl_l1.deployment.robust_controller import PRESETS
 from torchrl_l1.envs import DISTURBANCES, SUITES
-from torchrl_l1.experiment.files import write_atomically, write_table
-from torchrl_l1.experiment.run import MODES, check_wandb_mode
+from torchrl_l1.experiment.checkpoints import kept_by
+from torchrl_l1.experiment.evaluate import load_run
+from torchrl_l1.experiment.files import bounded, write_atomically, write_table
+from torchrl_l1.experiment.tracking import (
+    MODES,
+    Evaluated,
+    check_wandb_mode,
+    chosen_mode,
+    log_evaluation,
+)
+from torchrl_l1.experiment.wandb_files import known_id
 
 _PROJECT = "torchrl_l1"
 
@@ -71,6 +81,7 @@ def robustify_command(options: argparse.Namespace) -> None:
     output = Path(options.output or Path("runs/robustify", _folder(options.env)))
     if output.exists() and not output.is_dir():
         raise ValueError(f"{output} is a file; choose another --output")
+    output.mkdir(parents=True, exist_ok=True)
     robust = robustify(
         options.env,
         options.policy,
@@ -105,7 +116,7 @@ def robustify_command(options: argparse.Namespace) -> None:
 
 
 def _folder(env: str) -> str:
-    return "".join(letter if letter.isalnum() or letter in "._-" else "_" for letter in env)
+    return bounded("".join(c if c.isalnum() or c in "._-" else "_" for c in env))
 
 
 def _some_biases(robust: RobustController) -> dict[str, list[float]]:
@@ -143,10 +154,17 @@ def page(
 
 
 def _log(options: argparse.Namespace, table: Assessment, chart: Path, output: Path) -> None:
+    """To the W&B run of the training that the policy is from, if there is one, else to its own."""
+    policy = Path(options.policy)
+    if known_id(kept_by(policy) or policy):
+        trained = load_run(policy)
+        here = replace(trained.recipe.wandb, mode=options.wandb)
+        evaluated = Evaluated(f"robustify/{_folder(options.env)}", list(table), [chart])
+        log_evaluation(replace(trained.recipe, wandb=here), trained.path, evaluated)
+        return
     config = {name: value for name, value in vars(options).items() if name != "command"}
-    mode = None if options.wandb == "auto" else options.wandb
     with wandb.init(
-        mode=mode,
+        mode=chosen_mode(options.wandb),  # type: ignore[arg-type]
         project=_PROJECT,
         config=config,
         dir=str(output),

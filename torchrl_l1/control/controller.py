@@ -34,6 +34,7 @@ from torchrl_l1.control.pipeline import (
     check_time_step,
     leaf_spec,
     unspecified,
+    warn_of_surroundings,
     widen_selection,
 )
 from torchrl_l1.control.seal import SEAL, Emitted, sealed
@@ -192,8 +193,16 @@ class L1Primer(TensorDictPrimer):
         config = self._shared.settings.complete(environment)
         if self.check_dt:
             check_time_step("L1Controller", config.dt, environment)
-        if config.action_low is None or config.action_high is None:
-            self._shared.learn(*action_bounds(environment.full_action_spec[self.action_key]))
+        try:
+            spec = action_bounds(environment.full_action_spec[self.action_key])
+        except ValueError:  # of environments with different ones
+            if config.action_low is None or config.action_high is None:
+                raise
+            spec = None, None
+        bounds = config.action_low, config.action_high
+        warn_of_surroundings("L1Controller", environment, self.observation_key, bounds, spec)
+        if None in bounds:
+            self._shared.learn(*spec)
         self._is_checked = True
 
 

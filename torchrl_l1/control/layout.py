@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -134,7 +134,8 @@ def pack(
     entries["u_exec"] = executed
     if diagnostics is not None:
         entries.update(diagnostics._asdict())
-    return TensorDict(entries, batch_size=batch_size, device=device)
+    # Not TensorDict(...), whose checks of each entry are most of what this would take.
+    return TensorDict._new_unsafe(entries, batch_size=torch.Size(batch_size), device=device)
 
 
 def _vector_spec(env: EnvBase, kind: str, key: NestedKey) -> TensorSpec:
@@ -250,8 +251,9 @@ def advance(
             f"{owner} found no state under {key!r}: {remedy}, and let no transform rename or "
             "remove it"
         )
-    entries = {name: nested.get(name, None) for name in names}
-    seal = nested.get(SEAL, None) if check else None
+    found = dict(nested.items())  # a look-up of each would cost as much as a small kernel
+    entries: dict[str, Any] = {name: found.get(name) for name in names}
+    seal = found.get(SEAL) if check else None
     missing = [name for name, value in entries.items() if value is None]
     if check and seal_is_required and seal is None:
         missing.append(SEAL)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from typing import Any
@@ -19,6 +20,8 @@ from torchrl.envs.transforms import (
     FrameSkipTransform,
     SelectTransform,
     Transform,
+    VecNorm,
+    VecNormV2,
 )
 
 from torchrl_l1.control.config import L1Config, Scalars
@@ -312,3 +315,78 @@ def leaf_spec(spec: TensorSpec) -> TensorSpec:
     if len(leaves) != 1:
         raise ValueError(f"action_spec has several entries {leaves}: give that of the action")
     return spec[leaves[0]]
+
+
+def warn_of_surroundings(
+    owner: str,
+    env: EnvBase,
+    observation_key: NestedKey,
+    bounds: tuple[Scalars | None, Scalars | None],
+    spec: tuple[Scalars | None, Scalars | None],
+) -> None:
+    """Say what L1 can work with and hardly anybody wants.
+
+    Args:
+        owner: name of the face.
+        env: up to where L1 is.
+        observation_key: of the observation.
+        bounds: lower and upper ones of the action in the settings.
+        spec: those of the action's spec.
+
+    Warns:
+        UserWarning: of bounds beyond the spec's, and of a normaliser whose statistics change.
+    """
+    for name, sign, given, told in zip(
+        ("action_low", "action_high"), (-1, 1), bounds, spec, strict=True
+    ):
+        if _is_beyond(given, told, sign):
+            warnings.warn(
+                f"{owner} has {name}={given}, but the environment's action ends at {told}: what L1 "
+                "sends beyond that does not arrive, and L1 does not know; leave the bounds out, or "
+                "give infinite ones if the spec is wrong",
+                UserWarning,
+                stacklevel=3,
+            )
+    normaliser = _running_normaliser(env, observation_key)
+    if normaliser is not None:
+        warnings.warn(
+            f"{normaliser} stands between the plant and {owner} and changes its statistics as it "
+            f"goes, and with them what {observation_key!r} means to the model: freeze it, or put "
+            "it behind L1 with separate out_keys",
+            UserWarning,
+            stacklevel=3,
+        )
+
+
+def _is_beyond(given: Scalars | None, told: Scalars | None, sign: int) -> bool:
+    if given is None or told is None:
+        return False
+    width = max(len(one) if isinstance(one, tuple) else 1 for one in (given, told))
+    mine, theirs = (one if isinstance(one, tuple) else (one,) * width for one in (given, told))
+    return any(
+        math.isfinite(a) and sign * (a - b) > _TOLERANCE * abs(b)
+        for a, b in zip(mine, theirs, strict=True)
+    )
+
+
+def _running_normaliser(env: EnvBase, observation_key: NestedKey) -> str | None:
+    """Name of what normalises the observation by statistics that it goes on to change."""
+    while isinstance(env, TransformedEnv):
+        for transform in _flatten(env.transform):
+            if (
+                isinstance(transform, (VecNorm, VecNormV2))
+                and not transform.frozen
+                and observation_key in transform.out_keys
+            ):
+                return type(transform).__name__
+        env = env.base_env
+    if isinstance(env, SerialEnv):
+        members = env.__dict__.get("_envs", [])
+        return _running_normaliser(members[0], observation_key) if members else None
+    wrapped = env.__dict__.get("_env", None)
+    while wrapped is not None:
+        # Gymnasium's, of which there is one for vectors too.
+        if type(wrapped).__name__ == "NormalizeObservation":
+            return "NormalizeObservation" if wrapped.update_running_mean else None
+        wrapped = getattr(wrapped, "__dict__", {}).get("env", None)
+    return None

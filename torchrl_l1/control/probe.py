@@ -84,12 +84,36 @@ def probe(
     if rows > MOST_ROWS:
         observation = observation.reshape(rows, -1)[:MOST_ROWS]
         action = action.reshape(rows, -1)[:MOST_ROWS]
+    _warn_of_units(dynamics, observation)
     devices = [observation.device] if observation.device.type == "cuda" else []
     with torch.no_grad(), torch.random.fork_rng(devices):
         value = change(observation, action)
         _check_repeatable(dynamics, change, observation, action, value)
         _check_rows(dynamics, change, observation, action, value)
         return _choose_mode(dynamics, change, jacobians, observation, action, value)
+
+
+def _warn_of_units(dynamics: object, observation: Tensor) -> None:
+    """Say so where the first observations lie far from what a model says that it has seen."""
+    box = getattr(dynamics, "box", None)
+    low, high = getattr(box, "low", None), getattr(box, "high", None)
+    if not (isinstance(low, Tensor) and isinstance(high, Tensor) and low.shape == high.shape):
+        return
+    if low.shape != observation.shape[-1:]:
+        return
+    width = high - low
+    rows = observation.reshape(-1, observation.shape[-1])
+    beyond = torch.maximum(rows - high, low - rows) > width
+    # Infinite before a fit, and without width where the data do not vary.
+    far = (beyond & width.isfinite() & (width > 0)).float().mean(0) > 0.5
+    if far.any():
+        entries = far.nonzero().flatten().tolist()
+        warnings.warn(
+            f"the first observation lies far from the data that {describe(dynamics)} was fitted "
+            f"to, in the entries {entries}: is it in other units, as behind a normaliser, or the "
+            "model one of another plant?",
+            stacklevel=2,
+        )
 
 
 def refuse_training(dynamics: object) -> None:

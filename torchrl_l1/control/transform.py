@@ -23,6 +23,7 @@ from torchrl_l1.control.pipeline import (
     check_order,
     check_time_step,
     unspecified,
+    warn_of_surroundings,
     widen_selection,
 )
 from torchrl_l1.control.seal import SEAL, Emitted, sealed
@@ -134,6 +135,7 @@ class L1Transform(Transform):
         self.diagnostics = diagnostics
         self.dtype = self.model.dtype if dtype is None else dtype
         self._layout: Layout | None = None
+        self._zero: TensorDictBase | None = None
         self._is_ready = self._is_stateful = False
         self._step_config: L1Config | None = None
         self._step_function: StepFunction | None = None
@@ -168,7 +170,7 @@ class L1Transform(Transform):
         super().empty_cache()
 
     def _forget(self) -> None:
-        self._layout = None
+        self._layout = self._zero = None
         self._emitted = self._consumed = None
         self._lacking = None
 
@@ -291,13 +293,18 @@ class L1Transform(Transform):
             )
 
     def _fresh(self, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        config = self._settings.config
-        fresh = self._resolve().zero(tensordict_reset.batch_size, config, self.diagnostics)
+        batch_size = tensordict_reset.batch_size
+        if self._zero is None or self._zero.batch_size != batch_size:
+            # Kept, since some environment of a batch is reset at every other step.
+            config = self._settings.config
+            self._zero = self._resolve().zero(batch_size, config, self.diagnostics)
+        fresh = self._zero.clone()
         self._seal(fresh, tensordict_reset.get(self.observation_key))
         return fresh
 
     def _seal(self, nested: TensorDictBase, observation: Tensor) -> None:
-        state = L1State(**{name: nested.get(name) for name in self._state_names})
+        found = dict(nested.items())
+        state = L1State(**{name: found[name] for name in self._state_names})
         seal = sealed(observation, state)
         nested.set(SEAL, seal)
         if not torch.compiler.is_compiling():
@@ -314,7 +321,7 @@ class L1Transform(Transform):
             self.model.check_dimensions(*dimensions)
             # An environment with its state in the tensordict may step from any state, also twice.
             self._is_stateful = not list(parent.base_env.full_state_spec.keys(True, True))
-            self._layout, self._is_ready = layout, False
+            self._layout, self._is_ready, self._zero = layout, False, None
         return self._layout
 
     def _complete(self) -> None:
@@ -325,6 +332,9 @@ class L1Transform(Transform):
         config = self._settings.complete(parent)
         if self.check_dt:
             check_time_step("L1Transform", config.dt, parent)
+        bounds = config.action_low, config.action_high
+        spec = layout.low, layout.high
+        warn_of_surroundings("L1Transform", parent, self.observation_key, bounds, spec)
         config = layout.bounded(config)
         if self._step_function is None or config != self._step_config:
             self._step_function = make_step(config, self.model, self.compile_mode, self.diagnostics)
@@ -361,6 +371,7 @@ class L1Transform(Transform):
         empty = {
             "_step_function": None,
             "_layout": None,
+            "_zero": None,
             "_emitted": None,
             "_consumed": None,
             "_lacking": None,

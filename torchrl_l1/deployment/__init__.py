@@ -1,16 +1,12 @@
 """L1 around policies of any origin: from a policy to a robust one, films and exports."""
 
+from torchrl_l1.control import time_step
 from torchrl_l1.deployment.assessment import Assessment
-from torchrl_l1.deployment.environments import (
-    EnvironmentSource,
-    environment_source,
-    time_step,
-    vector_environment,
-)
 from torchrl_l1.deployment.export import ControlledStep, Exported, export
 from torchrl_l1.deployment.learning import Exploration, target_switch_rate
 from torchrl_l1.deployment.policies import FunctionPolicy, StableBaselinesPolicy, load_policy
 from torchrl_l1.deployment.robust_controller import RobustController, load_target, robustify
+from torchrl_l1.envs import EnvironmentSource, environment_source, vector_environment
 
 __all__ = [
     "Assessment",

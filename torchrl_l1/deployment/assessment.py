@@ -17,10 +17,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_l1.algorithms.collection import ORACLE, seed_streams, stream_seed
 from torchrl_l1.control import L1Config, L1Transform, OracleTransform
-from torchrl_l1.deployment.environments import EnvironmentSource
 from torchrl_l1.deployment.learning import policy_transforms
 from torchrl_l1.dynamics import EnsembleDynamics
-from torchrl_l1.envs import DISTURBANCES, SUITES, suite
+from torchrl_l1.envs import DISTURBANCES, SUITES, EnvironmentSource, suite
 from torchrl_l1.experiment.l1_options import OFF, UNTUNED
 from torchrl_l1.experiment.matrix import disturbance_words, disturbed
 from torchrl_l1.report.page import markdown
@@ -92,7 +91,7 @@ def run_episodes(
     With one seed, episodes of one number start from the same reset whatever the disturbance and
     the control.
     """
-    extra = [*policy_transforms(policy), *control]
+    extra = [*policy_transforms(policy, source.one), *control]
     env = source.several(episodes, disturbances, extra)
     env.set_seed(stream_seed(seed, "evaluate") % 2**31)
     seed_streams(seed, "evaluate")

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -17,13 +18,14 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_l1.atomic import write_atomically
 from torchrl_l1.checks import check_choice, check_count
 from torchrl_l1.control import ActionJacobian, L1Config, L1State, L1Transform, augment, init
 from torchrl_l1.deployment.assessment import run_episodes
-from torchrl_l1.deployment.environments import require
 from torchrl_l1.deployment.policies import FunctionPolicy
 from torchrl_l1.deployment.robust_controller import RobustController
 from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.envs.references import require
 
 FORMATS = {".pt": "torchscript", ".ts": "torchscript", ".onnx": "onnx", ".pt2": "export"}
 """What a file holds, by its suffix."""
@@ -153,13 +155,12 @@ def export(
     given = () if with_policy else (recorded["action"][:1],)
     example = (first, *given, *module.fresh.values())
     file.parent.mkdir(parents=True, exist_ok=True)
-    # Beside the file: what is there already stays if this one is no good.
-    beside = file.with_name(f".{file.stem}.tmp{file.suffix}")
-    with torch.no_grad(), _quiet():
+    # In a folder of its own: what is there already stays if this one is no good.
+    with torch.no_grad(), _quiet(), TemporaryDirectory() as folder:
+        written = Path(folder, f"function{file.suffix}")
         try:
-            step = _WRITERS[format](module, example, beside, inputs, outputs)
+            step = _WRITERS[format](module, example, written, inputs, outputs)
         except Exception as error:  # of the tracers, anything
-            beside.unlink(missing_ok=True)
             if not with_policy:
                 raise
             why = next(iter(str(error).split("\n", 1)), "").strip() or type(error).__name__
@@ -168,16 +169,16 @@ def export(
                 "(with_policy=False, --without-policy)"
             ) from error
         worst = _compare(step, recorded, module, with_policy)
+        content = written.read_bytes()
     half = config.half_range
     allowed = tolerance * (min(half) if isinstance(half, tuple) else half)
     if not worst <= allowed:
-        beside.unlink(missing_ok=True)
         raise ValueError(
             f"{file} differs from the original by up to {worst:.3g} action units in {steps} steps, "
             f"and {allowed:.3g} are allowed: a policy that draws random numbers, or that is not "
             "made of torch's operations, cannot be exported (see with_policy, --without-policy)"
         )
-    beside.replace(file)
+    write_atomically(file, content)
     return Exported(file, inputs, outputs, worst, steps)
 
 

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.data import Bounded, TensorSpec
-from torchrl.envs import Transform
+from torchrl.data import Bounded, ReplayBuffer, TensorSpec
+from torchrl.envs import Compose, EnvBase, InitTracker, TensorDictPrimer, Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules.utils import get_primers_from_module
 
 from torchrl_l1.algorithms.collection import seed_streams, stream_seed
-from torchrl_l1.deployment.environments import EnvironmentSource
-from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.dynamics import EnsembleDynamics, read_transitions
+from torchrl_l1.envs import EnvironmentSource
 
 FEW_OBSERVATIONS = 5
 """Below this width of the observation, the paper's rule of thumb allows few switches."""
 
 _MEAN_HOLD = 10
+
+_ROWS = 10  # recorded steps are laid side by side in so many
 
 
 class Exploration(TensorDictModuleBase):
@@ -68,10 +72,27 @@ class Exploration(TensorDictModuleBase):
         return tensordict.set("action", action)
 
 
-def policy_transforms(policy: TensorDictModuleBase) -> list[Transform]:
-    """What an environment needs for a policy with a memory."""
-    primer = getattr(policy, "make_tensordict_primer", None)
-    return [] if primer is None else [primer()]
+def policy_transforms(
+    policy: TensorDictModuleBase, make_env: Callable[[], EnvBase]
+) -> list[Transform]:
+    """What an environment needs for a policy with a memory, wherever in the policy that is.
+
+    Args:
+        policy: the policy.
+        make_env: makes such an environment, to which nothing is added that it has already.
+    """
+    primers = get_primers_from_module(policy, warn=False)
+    tracked = "is_init" in policy.in_keys
+    if primers is None and not tracked:
+        return []
+    there = set(make_env().full_observation_spec.keys(True, True))
+    found: list[Transform] = []
+    if tracked and "is_init" not in there:
+        found.append(InitTracker())
+    for primer in () if primers is None else primers.modules():
+        if isinstance(primer, TensorDictPrimer) and set(primer.primers.keys(True, True)) - there:
+            found.append(primer.clone() if isinstance(primers, Compose) else primer)
+    return found
 
 
 def collect(
@@ -97,7 +118,7 @@ def collect(
     Returns:
         ``[environments, T]``; episodes follow each other in a row.
     """
-    env = source.several(environments, control=policy_transforms(policy))
+    env = source.several(environments, control=policy_transforms(policy, source.one))
     env.set_seed(stream_seed(seed, "collect") % 2**31)
     seed_streams(seed, "collect")
     rows = env.batch_size.numel()
@@ -113,6 +134,40 @@ def collect(
         )
     env.close()
     return data
+
+
+def recorded(
+    data: TensorDictBase | ReplayBuffer | Sequence[TensorDictBase], env: EnvBase
+) -> TensorDictBase:
+    """Recorded steps in the form of :func:`collect`'s, what is no transition left out.
+
+    Args:
+        data: undisturbed transitions, see :func:`~torchrl_l1.dynamics.read_transitions`.
+        env: the environment that they are of.
+
+    Returns:
+        ``[rows, T]``, float32.
+
+    Raises:
+        ValueError: if widths are not the environment's, or there are too few of them.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the fit, which reads them too, says what it drops
+        found = read_transitions(data, dtype=torch.float32)
+    count = len(found.data)
+    for name, spec in (
+        ("observation", env.full_observation_spec["observation"]),
+        ("action", env.full_action_spec["action"]),
+    ):
+        width = found.data[name].shape[-1] if count else 0
+        if count < 2 or width != spec.shape[-1]:
+            raise ValueError(
+                f"the data hold {count} transitions with an {name} of width {width}, and the "
+                f"environment has one of {spec.shape[-1]}: are they of this environment?"
+            )
+    steps = found.data.set(("next", "done"), ~found.joined[:, None])
+    rows = max(1, min(_ROWS, count // _ROWS))
+    return steps[: count // rows * rows].reshape(rows, -1)
 
 
 def target_switch_rate(observation_dim: int) -> float:

@@ -6,7 +6,9 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import mujoco
@@ -19,11 +21,13 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_l1.algorithms.collection import seed_streams, stream_seed
+from torchrl_l1.atomic import write_atomically, write_through
 from torchrl_l1.control import L1Transform
-from torchrl_l1.deployment.environments import require, simulation_of
 from torchrl_l1.deployment.learning import policy_transforms
 from torchrl_l1.deployment.robust_controller import RobustController
-from torchrl_l1.envs.rendering import draw_poses, rollout_frames
+from torchrl_l1.envs.references import require
+from torchrl_l1.envs.rendering import draw_poses, rollout_frames, write_gif
+from torchrl_l1.envs.sources import simulation_of
 from torchrl_l1.experiment.l1_options import OFF
 
 SUFFIXES = (".mp4", ".gif")
@@ -74,7 +78,7 @@ def film(
         ValueError: for an environment that cannot be drawn, or an unknown preset.
     """
     source = robust.source
-    control: list[Transform] = policy_transforms(robust.policy)
+    control: list[Transform] = policy_transforms(robust.policy, source.one)
     if l1 != OFF:
         control.append(L1Transform(robust.model, robust.settings(l1)))
     mujoco_ = source.task is not None or _physics(source.one()) is not None
@@ -95,8 +99,7 @@ def film(
         seed_streams(seed, "play")
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             data = env.rollout(steps, robust.policy, callback=record)
-    if not shown:
-        record()  # of an episode of a single step
+    record()  # the last step, after which nothing is called
     ended = bool(data["next", "terminated"].any())
     frames = shown
     if source.task is not None:
@@ -176,6 +179,12 @@ def check_film(file: Path | None) -> None:
         require("imageio_ffmpeg", "video")
 
 
+def _in_real_time(frames: Sequence[np.ndarray], dt: float) -> tuple[list[np.ndarray], float]:
+    """Frames of which no more than fifty come in a second, and the time of each, s."""
+    every = max(1, round(0.02 / dt))
+    return list(frames)[::every], dt * every
+
+
 def write_film(frames: Sequence[np.ndarray], file: str | Path, dt: float) -> Path:
     """Write frames in real time, as far as a player can follow.
 
@@ -190,26 +199,34 @@ def write_film(frames: Sequence[np.ndarray], file: str | Path, dt: float) -> Pat
     file = Path(file)
     check_film(file)
     file.parent.mkdir(parents=True, exist_ok=True)
-    # No more than fifty pictures a second.
-    every = max(1, round(0.02 / dt))
-    frames, seconds = list(frames)[::every], dt * every
+    frames, seconds = _in_real_time(frames, dt)
     if file.suffix == ".gif":
         images = [Image.fromarray(frame) for frame in frames]
         duration = max(20, round(1000 * seconds))
-        images[0].save(file, save_all=True, append_images=images[1:], duration=duration, loop=0)
+        write_through(file, partial(write_gif, images, duration))
         return file
     ffmpeg = require("imageio_ffmpeg", "video")
     height, width = (side - side % 2 for side in frames[0].shape[:2])  # as the format asks
-    writer = ffmpeg.write_frames(str(file), (width, height), fps=1 / seconds, macro_block_size=2)
-    writer.send(None)
-    for frame in frames:
-        writer.send(np.ascontiguousarray(frame[:height, :width]))
-    writer.close()
+    with TemporaryDirectory() as folder:
+        film = Path(folder, "film.mp4")
+        writer = ffmpeg.write_frames(
+            str(film), (width, height), fps=1 / seconds, macro_block_size=2
+        )
+        writer.send(None)
+        for frame in frames:
+            writer.send(np.ascontiguousarray(frame[:height, :width]))
+        writer.close()
+        write_atomically(file, film.read_bytes())
     return file
 
 
 def show_film(frames: Sequence[np.ndarray], dt: float, title: str) -> None:
-    """Show frames in a window until it is closed.
+    """Show frames in real time in a window until it is closed.
+
+    Args:
+        frames: RGB images.
+        dt: time of a step in seconds.
+        title: of the window.
 
     Raises:
         ValueError: if no window can be opened.
@@ -224,6 +241,7 @@ def show_film(frames: Sequence[np.ndarray], dt: float, title: str) -> None:
         raise ValueError(
             "no toolkit of windows is installed (such as python3-tk): give --output FILE.mp4"
         )
+    frames, seconds = _in_real_time(frames, dt)
     height, width = frames[0].shape[:2]
     figure = pyplot.figure(title, figsize=(width / 100, height / 100), dpi=100)
     axis = figure.add_axes((0, 0, 1, 1))
@@ -234,6 +252,6 @@ def show_film(frames: Sequence[np.ndarray], dt: float, title: str) -> None:
         image.set_data(frames[index])
         return [image]
 
-    animation = FuncAnimation(figure, draw, len(frames), interval=1000 * dt, blit=True)
+    animation = FuncAnimation(figure, draw, len(frames), interval=1000 * seconds, blit=True)
     pyplot.show()
     del animation

@@ -7,7 +7,7 @@ import json
 import pickle
 import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -16,11 +16,15 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import unravel_key_list
 from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TensorDictPrimer
+from torchrl.modules.utils import get_primers_from_module
 
-from torchrl_l1.deployment.environments import load_attribute, require
+from torchrl_l1.envs import load_attribute
+from torchrl_l1.envs.references import require
+from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
 
 Policy: TypeAlias = str | TensorDictModuleBase | nn.Module | Callable[[Tensor], Any]
@@ -37,18 +41,28 @@ _FORMS = "sb3:FILE.zip, torchscript:FILE, onnx:FILE, MODULE:NAME, FILE.py:NAME, 
 class FunctionPolicy(TensorDictModuleBase):
     """A policy that is a function of the observation, as a TorchRL module.
 
-    It reads ``observation`` and writes ``action``, on batches as on single observations. A
-    function that takes one observation at a time is called for each by itself.
+    It reads ``observation`` and writes ``action``, on batches as on single observations. What the
+    function takes is found out by two observations near zero: tensors or else NumPy's arrays, and
+    batches where it does with them what it does with each observation by itself.
 
     Args:
         function: from an observation ``(n,)``, or several ``(N, n)``, to actions as a tensor, an
-            array or numbers. Modules stay in train or evaluation mode as they are.
+            array or numbers. Modules get their own type of numbers, and stay in train or
+            evaluation mode as they are.
         observation: spec of the observation, its last dimension n.
         action: spec of the action, whose shape, type and bounds count.
         rows: whether the function takes one observation at a time; found out if ``None``.
 
+    Attributes:
+        rows: whether it is called for each observation by itself.
+        arrays: whether it is called with arrays.
+
+    Warns:
+        UserWarning: if the function gives another action for the same observation when it is
+            called again.
+
     Raises:
-        ValueError: if the function returns no action for an observation of zeros.
+        ValueError: if the function returns no action.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -80,33 +94,61 @@ class FunctionPolicy(TensorDictModuleBase):
         for name, side in (("low", "low"), ("high", "high")):
             value = None if bounds is None else getattr(bounds, side).reshape(-1, self.width)[0]
             self.register_buffer(name, value)
-        n = observation.shape[-1]
-        self.rows = self._one_at_a_time(n) if rows is None else rows
+        self.rows, self.arrays = bool(rows), False
+        self._find_out(observation.shape[-1], (False, True) if rows is None else (rows,))
 
     @torch.no_grad()
-    def _one_at_a_time(self, n: int) -> bool:
+    def _find_out(self, n: int, forms: Sequence[bool]) -> None:
         probe = torch.linspace(-0.1, 0.1, 2 * n).reshape(2, n)
-        try:
-            together = self._call(probe)
-        except Exception:  # of a function that does not know batches, anything
-            together = torch.empty(0)
-        if together.shape == (2, self.width):
-            return False
-        try:
-            alone = self._call(probe[0])
-        except Exception as error:
-            raise ValueError(
-                f"the policy failed at an observation of width {n}: {error}"
-            ) from error
-        if alone.numel() != self.width:
-            raise ValueError(
-                f"the policy returned shape {tuple(alone.shape)} for an observation of width {n}; "
-                f"expected an action of width {self.width}"
+        causes: list[str] = []
+        # NumPy's functions take tensors, with a warning of theirs: arrays are what they are for.
+        for self.arrays, strict in ((False, True), (True, True), (False, False)):
+            with warnings.catch_warnings():
+                if strict:
+                    warnings.simplefilter("error", DeprecationWarning)
+                found = {rows: self._tried(probe, rows, causes) for rows in forms}
+                together, alone = found.get(False), found.get(True)
+                # Where rows and columns are confused, or a mean is over the batch, the shape may
+                # be right.
+                self.rows = together is None or not (alone is None or _close(together, alone))
+                first = alone if self.rows else together
+                if first is not None:
+                    again = self._tried(probe, self.rows, causes)
+                    break
+        else:
+            raise ValueError(f"the policy {causes[-1]}")
+        if again is None or not _close(first, again):
+            warnings.warn(
+                "the policy gives another action for the same observation when it is called again: "
+                "results vary if it draws at random, and are wrong if it remembers earlier calls, "
+                "which are those of several environments in turn; a memory belongs into the "
+                "tensordict, by a TorchRL module with make_tensordict_primer",
+                stacklevel=4,
             )
-        return True
+
+    def _tried(self, probe: Tensor, rows: bool, causes: list[str]) -> Tensor | None:
+        """Actions for two observations, or ``None`` and the cause."""
+        n = probe.shape[-1]
+        try:
+            found = [self._call(one) for one in (probe if rows else [probe])]
+        except Exception as error:  # of a function that does not know this form, anything
+            causes.append(f"failed at an observation of width {n}: {_short(error)}")
+            return None
+        if rows and all(action.numel() == self.width for action in found):
+            return torch.stack([action.reshape(self.width) for action in found])
+        if not rows and found[0].shape == (2, self.width):
+            return found[0]
+        causes.append(
+            f"returned shape {tuple(found[0].shape)} for an observation of width {n}; expected an "
+            f"action of width {self.width}"
+        )
+        return None
 
     def _call(self, observation: Tensor) -> Tensor:
-        found = self.function(observation)
+        if isinstance(self.function, nn.Module):
+            observation = observation.to(_number_type(self.function) or observation.dtype)
+        given: Any = observation.numpy() if self.arrays else observation
+        found: Any = self.function(given)
         found = found[0] if isinstance(found, tuple) else found
         return torch.as_tensor(np.asarray(found) if isinstance(found, list) else found)
 
@@ -166,6 +208,15 @@ class StableBaselinesPolicy(nn.Module):
         return torch.maximum(torch.minimum(action, self.high), self.low)
 
 
+def _close(one: Tensor, other: Tensor) -> bool:
+    return torch.allclose(one.double(), other.double(), 1e-4, 1e-5, equal_nan=True)
+
+
+def _number_type(module: nn.Module) -> torch.dtype | None:
+    kinds = (parameter.dtype for parameter in module.parameters())
+    return next((kind for kind in kinds if kind.is_floating_point), None)
+
+
 def load_policy(
     policy: Policy,
     env: EnvBase,
@@ -192,7 +243,7 @@ def load_policy(
     Args:
         policy: a source or an object.
         env: the environment that it is for, see
-            :func:`~torchrl_l1.deployment.environments.vector_environment`.
+            :func:`~torchrl_l1.envs.vector_environment`.
         normalization: file of the statistics of VecNormalize, a pickle, or ``"none"``.
         weights: file of a state dict to load into the module; pickles are refused in it.
 
@@ -207,7 +258,10 @@ def load_policy(
     found: Any = _from_source(policy, normalization) if isinstance(policy, str) else policy
     predicts = getattr(found, "predict", None)
     if callable(predicts) and hasattr(getattr(found, "policy", None), "squash_output"):
-        found = StableBaselinesPolicy(found.policy)  # a model of Stable-Baselines3
+        # A model of Stable-Baselines3, which knows the normaliser that it was trained behind.
+        found = StableBaselinesPolicy(
+            found.policy, _moments(getattr(found, "get_vec_normalize_env", lambda: None)())
+        )
     if weights is not None:
         if not isinstance(found, nn.Module):
             raise ValueError(
@@ -227,11 +281,34 @@ def load_policy(
         except (RuntimeError, TypeError, AttributeError) as error:
             raise ValueError(f"{weights} does not fit the policy: {_short(error)}") from error
     if isinstance(found, TensorDictModuleBase):
+        _check_keys(found, env)
         return found
     if not callable(found):
         raise ValueError(f"a {type(found).__name__} is no policy; policies are {_FORMS}")
     observation = env.full_observation_spec["observation"]
     return FunctionPolicy(found, observation, env.full_action_spec["action"])
+
+
+def _check_keys(policy: TensorDictModuleBase, env: EnvBase) -> None:
+    """Refuse a module that reads what the environment has not, or writes no action."""
+    if "action" not in unravel_key_list(policy.out_keys):
+        raise ValueError(
+            f"the policy writes {list(policy.out_keys)} and no 'action': wrap it in a module that "
+            "does, or rename its output"
+        )
+    primers = get_primers_from_module(policy, warn=False)
+    specs = [env.full_observation_spec, env.full_state_spec]
+    for primer in () if primers is None else primers.modules():
+        specs += [primer.primers] if isinstance(primer, TensorDictPrimer) else []
+    there = {"is_init"} | {key for spec in specs for key in spec.keys(True, True)}
+    missing = [key for key in unravel_key_list(policy.in_keys) if key not in there]
+    if missing:
+        raise ValueError(
+            f"the policy reads {missing}, which the environment does not have: it has "
+            f"{sorted(map(str, env.full_observation_spec.keys(True, True)))}. Let the function "
+            "that makes the environment add the transforms that the policy was trained with, or "
+            "give the module other in_keys"
+        )
 
 
 def _short(error: Exception) -> str:
@@ -251,7 +328,7 @@ def _from_source(source: str, normalization: str | None) -> Any:
             raise
         except Exception as error:  # of a foreign file, anything
             raise ValueError(f"{rest} cannot be read as {kind}: {_short(error)}") from error
-    if Path(source).is_dir():
+    if Path(source).is_dir() or (kept_by(Path(source)) and Path(source).is_file()):
         return list(load_run(source).algorithm.policies.values())[-1]
     if not rest:
         raise ValueError(f"unknown policy {source!r}; policies are {_FORMS}")
@@ -315,20 +392,23 @@ def _stable_baselines(file: Path, normalization: str | None) -> StableBaselinesP
     with zipfile.ZipFile(file) as archive:
         home = json.loads(archive.read("data"))["policy_class"]["__module__"]
     model = _algorithm(home).load(file, device="cpu")
-    statistics = None
+    stored = None
     if normalization not in (None, NO_NORMALIZATION):
         with open(str(normalization), "rb") as handle:
             stored = pickle.load(handle)
-        moments = stored.obs_rms
-        statistics = (
-            torch.as_tensor(moments.mean, dtype=torch.float64),
-            torch.as_tensor(moments.var, dtype=torch.float64),
-            float(stored.epsilon),
-            float(stored.clip_obs),
-        )
-        if not stored.norm_obs:
-            statistics = None
-    return StableBaselinesPolicy(model.policy, statistics)
+    return StableBaselinesPolicy(model.policy, _moments(stored))
+
+
+def _moments(normalize: Any) -> tuple[Tensor, Tensor, float, float] | None:
+    """Mean, variance, epsilon and clipping of VecNormalize, if it normalises observations."""
+    if normalize is None or not normalize.norm_obs:
+        return None
+    return (
+        torch.as_tensor(normalize.obs_rms.mean, dtype=torch.float64),
+        torch.as_tensor(normalize.obs_rms.var, dtype=torch.float64),
+        float(normalize.epsilon),
+        float(normalize.clip_obs),
+    )
 
 
 def _algorithm(home: str) -> Any:

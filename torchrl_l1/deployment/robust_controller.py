@@ -3,38 +3,39 @@
 from __future__ import annotations
 
 import json
-import shutil
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase, TransformedEnv
 from tqdm import tqdm
 
+from torchrl_l1.atomic import write_atomically
 from torchrl_l1.checks import check_choice, check_count, check_not_negative, check_positive
 from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.control.layout import Layout
 from torchrl_l1.deployment.assessment import Assessment, Disturbances, assess
-from torchrl_l1.deployment.environments import (
-    EnvironmentSource,
-    MakeEnv,
-    environment_source,
-    vector_environment,
-)
 from torchrl_l1.deployment.learning import (
     collect,
     epsilon_for,
     policy_transforms,
+    recorded,
     target_switch_rate,
 )
 from torchrl_l1.deployment.policies import Policy, load_policy
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, calibrate_filter, fit_dynamics
+from torchrl_l1.envs import EnvironmentSource, environment_source, vector_environment
+from torchrl_l1.envs.sources import MakeEnv
+from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
-from torchrl_l1.experiment.files import write_atomically
+from torchrl_l1.experiment.files import read_text
 from torchrl_l1.experiment.l1_options import OFF, closest_option, l1_option
 from torchrl_l1.experiment.settings import l1_config
 
@@ -48,6 +49,7 @@ FIT = FitConfig(max_epochs=200, max_gradient_steps=2000, patience=10, batch_size
 """How the model is fitted where nothing else is said."""
 
 _FORMAT = 1
+_MOST_BYTES = 1_000_000
 _FILE, _MODEL = "controller.json", "model.safetensors"
 
 
@@ -88,7 +90,10 @@ class RobustController:
         """
         config = self.settings(preset)
         env = TransformedEnv(vector_environment(env), auto_unwrap=True)
-        for transform in [*policy_transforms(self.policy), L1Transform(self.model, config)]:
+        for transform in [
+            *policy_transforms(self.policy, lambda: env),
+            L1Transform(self.model, config),
+        ]:
             env.append_transform(transform)
         return env
 
@@ -225,18 +230,25 @@ def _copied(file: Path, folder: Path, role: str) -> str:
     # With its role, since files of different folders may have one name.
     target = folder / (file.name if file.name.startswith(role) else f"{role}_{file.name}")
     if file.resolve() != target.resolve():
-        shutil.copyfile(file, target)
+        write_atomically(target, file.read_bytes())
     return target.name
 
 
 def _read(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
     """What a controller's file holds, and its settings of L1."""
     try:
-        stored = json.loads(file.read_text(encoding="utf-8"))
+        stored = json.loads(read_text(file, _MOST_BYTES))
         if stored["format"] == _FORMAT:
-            _ = stored["environment"], stored["policy"], stored["preset"]
-            return stored, {name: L1Config(**values) for name, values in stored["configs"].items()}
-    except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
+            names = [stored[name] for name in ("environment", "policy", "preset")]
+            names += [stored.get(name) for name in ("normalization", "weights")]
+            if not all(name is None or isinstance(name, str) for name in names):
+                raise TypeError("a name in it is no text")
+            configs = {name: L1Config(**values) for name, values in stored["configs"].items()}
+            _ = configs[stored["preset"]]
+            return stored, configs
+    except (
+        AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError
+    ) as error:  # fmt: skip
         raise ValueError(f"{file} is damaged ({error!r}): robustify the policy again") from error
     raise ValueError(
         f"{file} has the format {stored['format']!r}, and this version reads {_FORMAT}: robustify "
@@ -245,11 +257,9 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
 
 
 def _check_runs_nothing(folder: Path, stored: dict[str, Any]) -> None:
-    named = [stored["environment"], stored["policy"]]
-    data = ("torchscript", "onnx", "gymnasium", "dm_control")
-    for source in named:
-        kind = str(source or "").partition(":")[0]
-        if ":" in str(source or "") and kind not in data:
+    for what, data in (("environment", ()), ("policy", ("torchscript", "onnx"))):
+        source = str(stored[what] or "")
+        if ":" in source and source.partition(":")[0] not in data:
             raise ValueError(
                 f"{folder} names {source!r}, which would be run: say --trust if the folder is yours"
             )
@@ -270,6 +280,7 @@ def robustify(
     dt: float | None = None,
     epsilon: float | None = None,
     switch_rate: float | None = None,
+    data: TensorDictBase | ReplayBuffer | Sequence[TensorDictBase] | None = None,
     normalization: str | None = None,
     weights: str | None = None,
     environments: int = 10,
@@ -295,6 +306,8 @@ def robustify(
         epsilon: tolerance of the paper's switching law, state units.
         switch_rate: switches per 1000 steps that epsilon is found from otherwise; if ``None``, in
             the middle of the paper's rule of thumb, see :func:`target_switch_rate`.
+        data: undisturbed transitions to learn from in place of steps that are collected, see
+            :func:`~torchrl_l1.dynamics.fit_dynamics`; the environment is then for the tests alone.
         normalization: statistics of VecNormalize, see :func:`load_policy`.
         weights: state dict of the policy, see :func:`load_policy`.
         environments: environments that are stepped at once.
@@ -334,9 +347,14 @@ def robustify(
     with _private_randomness():
         env = source.one()
         acting = load_policy(policy, env, normalization, weights)
-        with _bar("collect", "step", progress) as bar:
-            bar.total = steps
-            data = collect(source, acting, steps, environments, noise, seed, bar.update)
+        if data is None:
+            with _bar("collect", "step", progress) as bar:
+                bar.total = steps
+                found = collect(source, acting, steps, environments, noise, seed, bar.update)
+            _warn_of_disturbances(env)
+            data = found
+        else:
+            found = recorded(data, env)
         with _bar("fit", "epoch", progress) as bar:
             dynamics = fit_dynamics(
                 data, config=fit or FIT, seed=seed, on_epoch=lambda _: bar.update(),
@@ -347,7 +365,7 @@ def robustify(
     if epsilon is None:
         n = dynamics.observation_dim
         rate = target_switch_rate(n) if switch_rate is None else switch_rate
-        epsilon, _ = epsilon_for(dynamics, data, rate)
+        epsilon, _ = epsilon_for(dynamics, found, rate)
     origin = {
         "policy": policy if isinstance(policy, str) else None,
         "normalization": normalization,
@@ -361,7 +379,7 @@ def robustify(
     calibrate_filter(
         dynamics.residuals,
         dynamics.value_and_jacobian,
-        data.reshape(-1).select("observation", "action", ("next", "observation")).float(),
+        found.reshape(-1).select("observation", "action", ("next", "observation")).float(),
         configs["robust"],
     )
     order = [preset, *(name for name in PRESETS if name != preset)]
@@ -369,6 +387,20 @@ def robustify(
         source, acting, dynamics, {name: configs[name] for name in reversed(order)},
         preset, origin,
     )  # fmt: skip
+
+
+def _warn_of_disturbances(env: EnvBase) -> None:
+    """Data are to be of the undisturbed plant: a bias in them is nominal to the model."""
+    while isinstance(env, TransformedEnv):
+        for transform in env.transform.modules():
+            if callable(getattr(transform, "compensate", None)):
+                warnings.warn(
+                    f"the environment brings {type(transform).__name__} along: the model takes "
+                    "it for the plant's, and L1 will not cancel it; give robustify the undisturbed "
+                    "environment, and evaluate the disturbances",
+                    stacklevel=3,
+                )
+        env = env.base_env
 
 
 def load_target(
@@ -399,6 +431,8 @@ def load_target(
             if (place / _FILE).exists():
                 return RobustController.load(place, trusted=trusted)
         return _of_run(folder)
+    if kept_by(folder) and folder.is_file():
+        return _of_run(folder)
     if policy is None:
         raise ValueError(
             f"there is no folder {target}; give a controller, a run directory, or an environment "
@@ -412,7 +446,7 @@ def load_target(
 def _of_run(folder: Path) -> RobustController:
     """A training with its own model; with its own L1, where it has one of that kind."""
     run = load_run(folder)
-    own, task = run.recipe.l1, run.recipe.task
+    own, task = run.recipe.l1, run.algorithm.task
     configs = {}
     for name in reversed(PRESETS):
         settings = own
@@ -424,7 +458,9 @@ def _of_run(folder: Path) -> RobustController:
     policy = list(run.algorithm.policies.values())[-1]
     model = run.algorithm.acting_dynamics
     origin = {"policy": str(folder)}
-    return RobustController(environment_source(task), policy, model, configs, origin=origin)
+    source = environment_source(run.recipe.task, run.recipe.search_path)
+    source = replace(source, observation_keys=tuple(run.recipe.observation_keys))
+    return RobustController(source, policy, model, configs, origin=origin)
 
 
 @contextmanager

@@ -12,10 +12,23 @@ from torchrl_l1.dynamics.fit import (
     fit_dynamics,
     fit_ensemble,
 )
-from torchrl_l1.dynamics.heads import HEADS, DeterministicHead, GaussianHead, Head, make_head
+from torchrl_l1.dynamics.heads import (
+    HEADS,
+    BernoulliHead,
+    DeterministicHead,
+    GaussianHead,
+    Head,
+    make_head,
+)
 from torchrl_l1.dynamics.imagination import EnsembleModelEnv, EnsembleWorldModel, imagine
 from torchrl_l1.dynamics.model import EnsembleDynamics
 from torchrl_l1.dynamics.normalizer import DataBox, Normalizer
+from torchrl_l1.dynamics.outcomes import (
+    RewardModel,
+    TerminationModel,
+    fit_reward,
+    fit_termination,
+)
 from torchrl_l1.dynamics.quality import FitQuality, measure_quality
 from torchrl_l1.dynamics.residuals import calibrate_filter
 from torchrl_l1.dynamics.transitions import Transitions, read_transitions
@@ -23,6 +36,7 @@ from torchrl_l1.dynamics.transitions import Transitions, read_transitions
 __all__ = [
     "HEADS",
     "MODEL_FORMS",
+    "BernoulliHead",
     "ControlAffineDynamics",
     "DataBox",
     "DeterministicHead",
@@ -37,11 +51,15 @@ __all__ = [
     "GaussianHead",
     "Head",
     "Normalizer",
+    "RewardModel",
+    "TerminationModel",
     "Transitions",
     "calibrate_filter",
     "evaluate_members",
     "fit_dynamics",
     "fit_ensemble",
+    "fit_reward",
+    "fit_termination",
     "imagine",
     "make_dynamics",
     "make_head",

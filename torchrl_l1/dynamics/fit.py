@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from inspect import signature
 from typing import Any
 
@@ -25,7 +26,7 @@ from torchrl_l1.dynamics.factory import make_dynamics
 from torchrl_l1.dynamics.model import EnsembleDynamics
 from torchrl_l1.dynamics.network import model_precision, resolve_precision
 from torchrl_l1.dynamics.quality import entry_names, measure_quality
-from torchrl_l1.dynamics.training_step import TrainingStep
+from torchrl_l1.dynamics.training_step import Members, TrainingStep
 from torchrl_l1.dynamics.transitions import Data, Transitions, read_transitions, two_parts
 
 
@@ -342,6 +343,8 @@ def fit_dynamics(
         dynamics = make_dynamics(n, m, **{"hidden": (128, 128), **settings}).to(here)
         optimizer = torch.optim.Adam(dynamics.parameters(), lr=config.learning_rate)
         fit_to_transitions(dynamics, transitions, config, optimizer, on_epoch)
+    if not bool(dynamics.residuals.measured):
+        raise ValueError("the fit diverged: look at learning_rate and at the scale of the data")
     dynamics.quality = measure_quality(dynamics, transitions, names, units)
     if dynamics.quality.warning:
         warnings.warn(dynamics.quality.warning, stacklevel=2)
@@ -357,7 +360,6 @@ def fit_to_transitions(
 ) -> FitReport:
     """As :func:`fit_ensemble`, to transitions that have been read."""
     _check(config, dynamics)
-    device = dynamics.device
     train, validation = two_parts(
         transitions.data,
         transitions.validation,
@@ -370,17 +372,51 @@ def fit_to_transitions(
     # Once for all batches: the statistics stay as they are.
     inputs = dynamics.normalize_inputs(train["observation"], train["action"])
     target = dynamics.change_normalizer.normalize(change)
-    loss = EnsembleDynamicsLoss(dynamics)
-    training_step = TrainingStep(
-        dynamics,
-        model_precision(dynamics, config.precision),
-        _decay(config, len(dynamics.network.weights), train.shape[0]),
+    validate = partial(evaluate_members, EnsembleDynamicsLoss(dynamics), validation)
+    best_loss, report = train_members(
+        dynamics, inputs, target, validate, config, optimizer, on_epoch
     )
-    members, size = dynamics.members, train.shape[0]
+    if config.elites is not None:
+        dynamics.set_elites(best_loss.topk(config.elites, largest=False).indices)
+    residual = one_step_residuals(dynamics, validation)
+    if bool(residual.isfinite().all()):  # else the loss tells that the fit diverged
+        dynamics.residuals.measure(residual)
+    return replace(report, dropped=transitions.dropped)
+
+
+def train_members(
+    model: Members,
+    inputs: Tensor,
+    target: Tensor,
+    validate: Callable[[], Tensor],
+    config: FitConfig,
+    optimizer: torch.optim.Optimizer,
+    on_epoch: Callable[[int], None] | None = None,
+) -> tuple[Tensor, FitReport]:
+    """The loop of a fit: all members at once, each on its own shuffle of the training data.
+
+    Args:
+        model: changed in place; see :func:`fit_ensemble` for the weights that it ends with.
+        inputs: normalised ``(N, in)``.
+        target: normalised ``(N, out)``.
+        validate: losses of the members on what is kept out of training ``(E,)``.
+        config: see :class:`FitConfig`; elites and shares of the data do not matter here.
+        optimizer: over the model's parameters.
+        on_epoch: called with the number of the finished epoch.
+
+    Returns:
+        validation losses of the weights that were kept ``(E,)``, and the report.
+    """
+    training_step = TrainingStep(
+        model,
+        model_precision(model, config.precision),
+        _decay(config, len(model.network.weights), inputs.shape[0]),
+    )
+    members, size, device = model.network.members, inputs.shape[0], inputs.device
     batch_size = min(config.batch_size, size)
     batches = size // batch_size
     best_loss = torch.full((members,), torch.inf, device=device)
-    own, shared = list(dynamics.network.parameters()), list(dynamics.head.parameters())
+    own, shared = list(model.network.parameters()), list(model.head.parameters())
     best_own, best_shared = _copy(own), _copy(shared)
     resample = torch.randint(size, (members, size)).to(device) if config.bootstrap else None
     planned = min(config.max_epochs * batches, config.max_gradient_steps)
@@ -401,7 +437,7 @@ def fit_to_transitions(
             if steps == config.max_gradient_steps:
                 break
         epoch += 1
-        current = evaluate_members(loss, validation)
+        current = validate()
         better = current < best_loss
         best_loss = torch.where(better, current, best_loss)
         for kept, parameter in zip(best_own, own, strict=True):
@@ -417,16 +453,12 @@ def fit_to_transitions(
         for kept, parameter in zip(best_own + best_shared, own + shared, strict=True):
             parameter.copy_(kept)
     if shared:  # the best weights of each member now meet parameters of another epoch
-        best_loss = evaluate_members(loss, validation)
-    if config.elites is not None:
-        dynamics.set_elites(best_loss.topk(config.elites, largest=False).indices)
-    dynamics.residuals.measure(one_step_residuals(dynamics, validation))
-    return FitReport(
+        best_loss = validate()
+    return best_loss, FitReport(
         train_loss=running.item() / (members * (batch + 1)),
         validation_loss=best_loss.mean().item(),
         epochs=epoch,
         gradient_steps=steps,
-        dropped=transitions.dropped,
     )
 
 

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import softplus
+from torch.nn.functional import binary_cross_entropy_with_logits, softplus
 
 from torchrl_l1.checks import check_choice, check_count, check_not_negative
 
@@ -216,6 +216,36 @@ class GaussianHead(Head):
     def penalty(self) -> Tensor:
         """``bound_penalty`` times the sum of the distances between upper and lower bounds."""
         return self.bound_penalty * (self.max_log_variance.sum() - self.min_log_variance.sum())
+
+
+class BernoulliHead(Head):
+    """The raw output is the log-odds of an event; trained with the cross-entropy.
+
+    Attributes:
+        weight: how many times the loss of an event counts, beside that of none, ``()``.
+    """
+
+    weight: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("weight", torch.ones(()))
+
+    def out_features(self, dim: int) -> int:
+        """Width of the raw output: that of the target."""
+        return dim
+
+    def loss(self, raw: Tensor, target: Tensor) -> Tensor:
+        """Cross-entropy in nats, events weighted, averaged over the target's columns."""
+        each = binary_cross_entropy_with_logits(
+            raw, target.expand_as(raw), pos_weight=self.weight, reduction="none"
+        )
+        return each.mean(-1)
+
+    def standard_deviation(self, raw: Tensor) -> Tensor:
+        """Of an event that is one or zero."""
+        probability = raw.sigmoid()
+        return (probability * (1 - probability)).sqrt()
 
 
 def _nats(squared: Tensor, variance: Tensor) -> Tensor:

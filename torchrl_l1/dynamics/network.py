@@ -18,6 +18,7 @@ from torchrl_l1.dynamics.control_affine import affine_coefficients, affine_outpu
 from torchrl_l1.dynamics.ensemble import ACTIVATIONS
 from torchrl_l1.dynamics.heads import DeterministicHead
 from torchrl_l1.dynamics.model import EnsembleDynamics
+from torchrl_l1.dynamics.training_step import Members
 
 Precision = Literal["auto", "float32", "bfloat16"]
 
@@ -79,10 +80,10 @@ def _multiplies_bfloat16_faster() -> bool:
     return seconds[torch.bfloat16] < 0.8 * seconds[torch.float32]
 
 
-def model_precision(dynamics: EnsembleDynamics, precision: str) -> Literal["float32", "bfloat16"]:
+def model_precision(model: Members, precision: str) -> Literal["float32", "bfloat16"]:
     """What ``precision`` becomes for a model, see :func:`resolve_precision`."""
-    widths = [weight.shape[2] for weight in dynamics.network.weights[:-1]]
-    return resolve_precision(precision, dynamics.device, min(widths, default=0))
+    widths = [weight.shape[2] for weight in model.network.weights[:-1]]
+    return resolve_precision(precision, model.device, min(widths, default=0))
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,14 @@ import json
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchrl_l1.atomic import write_atomically
 from torchrl_l1.dynamics.control_affine import ControlAffineDynamics
 from torchrl_l1.dynamics.heads import DeterministicHead, GaussianHead, Head
 from torchrl_l1.dynamics.model import EnsembleDynamics
@@ -37,10 +39,7 @@ def save_dynamics(dynamics: EnsembleDynamics, path: str | os.PathLike[str]) -> N
         "settings": settings,
         "sha256": _digest(settings, tensors.items()),
     }
-    path = Path(path)
-    part = path.with_name(f"{path.name}.part")
-    part.write_bytes(save(tensors, metadata))
-    part.replace(path)
+    write_atomically(Path(path), save(tensors, metadata))
 
 
 def load_dynamics(
@@ -69,7 +68,11 @@ def load_dynamics(
     settings = metadata.get("settings", "")
     if metadata.get("sha256") != _digest(settings, tensors.items()):
         raise ValueError(f"{path} is damaged: its contents are not what its checksum says")
-    return _restored(json.loads(settings), tensors, torch.device(device))
+    try:
+        return _restored(json.loads(settings), tensors, torch.device(device))
+    # Somebody may have made the checksum fit whatever they wrote.
+    except Exception as error:
+        raise ValueError(f"{path} holds no model: {_line(error)}") from error
 
 
 def _settings(dynamics: EnsembleDynamics) -> dict[str, Any]:
@@ -109,6 +112,12 @@ def _head_settings(head: Head) -> dict[str, Any]:
 def _restored(
     settings: dict[str, Any], tensors: Mapping[str, Tensor], device: torch.device
 ) -> EnsembleDynamics:
+    sizes = [settings["observation_dim"] + settings["action_dim"], *settings["hidden"]]
+    weights = settings["members"] * sum(a * b for a, b in pairwise(sizes))
+    # Before any memory is asked for.
+    largest = max(*sizes, weights, settings["members"], settings["head"].get("dim", 0))
+    if largest > sum(value.numel() for value in tensors.values()):
+        raise ValueError("its layers are larger than the file")
     kind, head, quality = (settings.pop(name) for name in ("form", "head", "quality"))
     gaussian = head.pop("name") == "gaussian"
     settings["head"] = GaussianHead(**head) if gaussian else DeterministicHead()

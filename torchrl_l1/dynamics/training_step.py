@@ -2,13 +2,37 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
 
-from torchrl_l1.dynamics.ensemble import ACTIVATIONS
-from torchrl_l1.dynamics.model import EnsembleDynamics
+from torchrl_l1.dynamics.ensemble import ACTIVATIONS, EnsembleMLP
+from torchrl_l1.dynamics.heads import Head
+
+
+class Members(Protocol):
+    """What a fit trains: the networks of an ensemble, and the head that says what they mean.
+
+    Attributes:
+        network: all members.
+        head: theirs; its parameters are trained too.
+        affine_in_action: whether :meth:`raw_from_output` changes what the networks give.
+    """
+
+    network: EnsembleMLP
+    head: Head
+    affine_in_action: bool
+
+    @property
+    def device(self) -> torch.device:
+        """Where they are."""
+
+    def network_inputs(self, inputs: Tensor) -> Tensor:
+        """What the networks read of normalised inputs."""
+
+    def raw_from_output(self, output: Tensor, inputs: Tensor) -> Tensor:
+        """What the head makes sense of, from what the networks give."""
 
 
 class TrainingStep:
@@ -22,12 +46,13 @@ class TrainingStep:
     input layer, and what the head sees stay float32.
 
     Args:
-        dynamics: the model. Its parameters keep the gradients in ``grad``, always in the same
+        model: the ensemble. Its parameters keep the gradients in ``grad``, always in the same
             memory.
         precision: ``"bfloat16"``, or ``"float32"`` for that of the parameters.
         decay: coefficients of half the squared weights, one per layer, or none.
 
     Examples:
+        >>> from torchrl_l1.dynamics import EnsembleDynamics
         >>> model = EnsembleDynamics(3, 1, members=2, hidden=(8,))
         >>> step = TrainingStep(model)
         >>> step(torch.randn(2, 50, 4), torch.randn(2, 50, 3)).shape
@@ -38,12 +63,12 @@ class TrainingStep:
 
     def __init__(
         self,
-        dynamics: EnsembleDynamics,
+        model: Members,
         precision: Literal["float32", "bfloat16"] = "float32",
         decay: list[float] | None = None,
     ) -> None:
-        network = dynamics.network
-        self.dynamics, self.decay = dynamics, decay or []
+        network = model.network
+        self.model, self.decay = model, decay or []
         self._activation = ACTIVATIONS[network.activation]
         self._weights = [weight.detach() for weight in network.weights]
         self._biases = [bias.detach() for bias in network.biases]
@@ -67,7 +92,7 @@ class TrainingStep:
             the members' losses ``(E,)``, without penalties.
         """
         weights = [w.to(dtype) for w, dtype in zip(self._weights, self._dtypes, strict=True)]
-        operands, sums = [self.dynamics.network_inputs(inputs)], []
+        operands, sums = [self.model.network_inputs(inputs)], []
         last = len(weights) - 1
         for layer, (weight, bias) in enumerate(zip(weights, self._biases, strict=True)):
             z = torch.bmm(operands[layer], weight)
@@ -97,13 +122,13 @@ class TrainingStep:
 
     def _head(self, output: Tensor, inputs: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         """The members' losses and the gradient by the network's output ``(E, B, out)``."""
-        dynamics = self.dynamics
-        if not dynamics.affine_in_action:
-            return dynamics.head.loss_and_gradient(output, target)
+        model = self.model
+        if not model.affine_in_action:
+            return model.head.loss_and_gradient(output, target)
         with torch.enable_grad():
             output.requires_grad_()
-            raw = dynamics.raw_from_output(output, inputs)
-        losses, by_raw = dynamics.head.loss_and_gradient(raw.detach(), target)
+            raw = model.raw_from_output(output, inputs)
+        losses, by_raw = model.head.loss_and_gradient(raw.detach(), target)
         (gradient,) = torch.autograd.grad(raw, output, by_raw)
         return losses, gradient
 

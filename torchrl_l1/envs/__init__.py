@@ -17,6 +17,7 @@ from torchrl_l1.envs.actuators import (
     WalkBias,
 )
 from torchrl_l1.envs.disturbances import RandomSigns, Uniform
+from torchrl_l1.envs.external import ExternalEnv, ExternalTask
 from torchrl_l1.envs.factory import disturbance_transforms, make_env
 from torchrl_l1.envs.gymnasium_env import MujocoTaskEnv
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
@@ -30,9 +31,11 @@ from torchrl_l1.envs.perturbations import (
     suite,
 )
 from torchrl_l1.envs.plant import disturbed_model, wind_force
+from torchrl_l1.envs.references import load_attribute, load_module
 from torchrl_l1.envs.sensors import SensorBias, SensorDelay, SensorDropout
 from torchrl_l1.envs.simulation import BatchedSimulator, StartStates, TaskSimulation
-from torchrl_l1.envs.task import Task
+from torchrl_l1.envs.sources import EnvironmentSource, environment_source, vector_environment
+from torchrl_l1.envs.task import AnyTask, Task, action_bounds
 from torchrl_l1.envs.tasks import TASKS, get_task
 from torchrl_l1.registration import gymnasium_id, register_tasks
 
@@ -46,10 +49,14 @@ __all__ = [
     "ActuatorBias",
     "ActuatorDelay",
     "ActuatorGain",
+    "AnyTask",
     "BatchedMujocoEnv",
     "BatchedSimulator",
     "DeadZone",
     "Disturbance",
+    "EnvironmentSource",
+    "ExternalEnv",
+    "ExternalTask",
     "FailingMotor",
     "MujocoTaskEnv",
     "ObservationNoise",
@@ -66,12 +73,17 @@ __all__ = [
     "TaskSimulation",
     "Uniform",
     "WalkBias",
+    "action_bounds",
     "disturbance_transforms",
     "disturbed_model",
+    "environment_source",
     "get_task",
     "gymnasium_id",
+    "load_attribute",
+    "load_module",
     "make_env",
     "register_tasks",
     "suite",
+    "vector_environment",
     "wind_force",
 ]

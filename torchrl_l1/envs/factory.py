@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torchrl.envs import Compose, Transform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
 from torchrl_l1.envs.perturbations import (
@@ -15,7 +15,8 @@ from torchrl_l1.envs.perturbations import (
     Disturbance,
     ObservationNoise,
 )
-from torchrl_l1.envs.task import Task
+from torchrl_l1.envs.task import AnyTask, Task
+from torchrl_l1.envs.tasks import get_task
 
 
 def _differs(value: Any, neutral: float) -> bool:
@@ -78,7 +79,7 @@ def _placed(active: list[tuple[Disturbance, Any]]) -> tuple[list[Transform], lis
 
 
 def make_env(
-    task: str | Task,
+    task: str | AnyTask,
     num_envs: int = 1,
     *,
     action_noise: float = 0.0,
@@ -107,7 +108,8 @@ def make_env(
     the gain scales. The rollout's ``"action"`` is what the policy wrote.
 
     Args:
-        task: a key of :data:`~torchrl_l1.envs.TASKS`, or a :class:`~torchrl_l1.envs.Task`.
+        task: a key of :data:`~torchrl_l1.envs.TASKS`, any other name that :func:`get_task` takes,
+            or a task itself.
         num_envs: number of environments.
         action_noise: half-width of :class:`~torchrl_l1.envs.ActionNoise`.
         observation_noise: half-width of :class:`~torchrl_l1.envs.ObservationNoise`.
@@ -143,13 +145,16 @@ def make_env(
     if observation_noise != 0:
         transforms.append(ObservationNoise(observation_noise))
     transforms += sensors
-    base = BatchedMujocoEnv(
-        task,
-        num_envs,
-        seed=seed,
-        max_steps=max_steps,
-        dtype=dtype,
-        threads=threads,
-        plant={entry.name: value for entry, value in active if entry.transform is None},
-    )
+    found = get_task(task)
+    settings: dict[str, Any] = {
+        "seed": seed,
+        "max_steps": max_steps,
+        "dtype": dtype,
+        "threads": threads,
+        "plant": {entry.name: value for entry, value in active if entry.transform is None},
+    }
+    if isinstance(found, Task):
+        base: EnvBase = BatchedMujocoEnv(found, num_envs, **settings)
+    else:
+        base = found.environment(num_envs, **settings)  # type: ignore[attr-defined]
     return TransformedEnv(base, Compose(*transforms, *extra_transforms))

@@ -12,7 +12,7 @@ from gymnasium.spaces import Box
 
 from torchrl_l1.envs.simulation import TaskSimulation
 from torchrl_l1.envs.task import Task
-from torchrl_l1.envs.tasks import get_task
+from torchrl_l1.envs.tasks import built_in_task
 
 _ONLY = np.zeros(1, dtype=np.int64)
 
@@ -58,7 +58,7 @@ class MujocoTaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         width: int = 480,
         height: int = 480,
     ) -> None:
-        self.task = task = get_task(task)
+        self.task = task = built_in_task(task)
         modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in modes:
             raise ValueError(f"render_mode must be None or one of {modes}, got {render_mode!r}")

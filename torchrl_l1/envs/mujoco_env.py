@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 from torchrl_l1.envs.plant import PlantValue
 from torchrl_l1.envs.simulation import TaskSimulation
 from torchrl_l1.envs.task import Task
-from torchrl_l1.envs.tasks import get_task
+from torchrl_l1.envs.tasks import built_in_task
 
 
 class BatchedMujocoEnv(EnvBase):
@@ -72,7 +72,7 @@ class BatchedMujocoEnv(EnvBase):
         threads: int = 1,
         plant: Mapping[str, PlantValue] | None = None,
     ) -> None:
-        task = get_task(task)
+        task = built_in_task(task)
         max_steps = task.horizon if max_steps is None else max_steps
         counts = {"num_envs": num_envs, "max_steps": max_steps, "threads": threads}
         for name, value in counts.items():

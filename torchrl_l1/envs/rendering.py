@@ -7,15 +7,18 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import IO
 
 import mujoco
 import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
+from torchrl_l1.atomic import write_through
 from torchrl_l1.envs.task import Task
-from torchrl_l1.envs.tasks import get_task
+from torchrl_l1.envs.tasks import built_in_task
 
 _WORKER = Path(__file__).with_name("_render_worker.py")
 _TIMEOUT_SECONDS = 300
@@ -74,7 +77,7 @@ def rollout_frames(
         ValueError: if ``qpos`` has the wrong shape.
         RenderingUnavailable: if no backend works; the message says what each of them reported.
     """
-    return draw_poses(_decorated(get_task(task)), qpos, size=size)
+    return draw_poses(_decorated(built_in_task(task)), qpos, size=size)
 
 
 def draw_poses(
@@ -167,7 +170,9 @@ def filmstrip(
     figure.subplots_adjust(wspace=0.03, hspace=0.03)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110, bbox_inches="tight")
+    write_through(
+        path, lambda file: figure.savefig(file, format="png", dpi=110, bbox_inches="tight")
+    )
     return path
 
 
@@ -207,5 +212,17 @@ def animation(
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     duration = max(20, round(1000 * dt * every))
-    images[0].save(path, save_all=True, append_images=images[1:], duration=duration, loop=0)
+    write_through(path, partial(write_gif, images, duration))
     return path
+
+
+def write_gif(images: Sequence[Image.Image], duration: int, file: IO[bytes]) -> None:
+    """Write pictures as a looping GIF.
+
+    Args:
+        images: the pictures.
+        duration: of each, ms.
+        file: open for writing.
+    """
+    first, *others = images
+    first.save(file, "GIF", save_all=True, append_images=others, duration=duration, loop=0)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrl_l1.envs.plant import Plant, PlantValue
 from torchrl_l1.envs.task import Task
-from torchrl_l1.envs.tasks import get_task
+from torchrl_l1.envs.tasks import built_in_task
 
 # Beyond this magnitude MuJoCo itself calls a number bad (mjMAXVAL).
 MAX_MAGNITUDE = 1e10
@@ -163,7 +163,7 @@ class StartStates:
     """
 
     def __init__(self, task: str | Task) -> None:
-        self.task = get_task(task)
+        self.task = built_in_task(task)
         data = mujoco.MjData(self.task.build_model())
         self._initial = (data.qpos.copy(), data.qvel.copy())
 

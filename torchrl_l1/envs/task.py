@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, TypeAlias
 
 import gymnasium
 import mujoco
@@ -15,6 +16,7 @@ from torch import Tensor
 
 ObserveFn = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 RewardFn = Callable[[Tensor, Tensor, Tensor], Tensor]
+Scalars: TypeAlias = float | tuple[float, ...]
 ResetFn = Callable[
     [np.random.Generator, np.ndarray, np.ndarray, int], tuple[np.ndarray, np.ndarray]
 ]
@@ -25,6 +27,71 @@ def never(next_observation: Tensor) -> Tensor:
     return torch.zeros(
         next_observation.shape[:-1], dtype=torch.bool, device=next_observation.device
     )
+
+
+class AnyTask(Protocol):
+    """What algorithms need to know of a task: one of ours, or an environment of elsewhere.
+
+    :class:`Task` and :class:`ExternalTask` are such. Bounds are one number, or one for each entry
+    of the action.
+    """
+
+    @property
+    def name(self) -> str:
+        """By which :func:`get_task` finds it."""
+
+    @property
+    def dt(self) -> float:
+        """Duration of one environment step in seconds."""
+
+    @property
+    def horizon(self) -> int:
+        """Environment steps after which an episode is truncated."""
+
+    @property
+    def observation_dim(self) -> int:
+        """Width ``n`` of the observation."""
+
+    @property
+    def action_dim(self) -> int:
+        """Width ``m`` of the action."""
+
+    @property
+    def action_low(self) -> Scalars:
+        """Lower bound of the action."""
+
+    @property
+    def action_high(self) -> Scalars:
+        """Upper bound of the action."""
+
+    @property
+    def imagined_reward(self) -> RewardFn:
+        """Reward of imagined rollouts."""
+
+    @property
+    def terminated(self) -> Callable[[Tensor], Tensor]:
+        """Whether an episode ends in a next observation ``(..., n)``."""
+
+    @property
+    def terminates(self) -> bool:
+        """Whether any state ends an episode."""
+
+
+def action_bounds(task: AnyTask, device: torch.device | str | None = None) -> tuple[Tensor, Tensor]:
+    """Lower and upper bounds of the action ``(m,)``, float32.
+
+    Examples:
+        >>> from torchrl_l1.envs import get_task
+        >>> action_bounds(get_task("swimmer"))
+        (tensor([-1., -1.]), tensor([1., 1.]))
+    """
+    low, high = (
+        torch.tensor(bound, device=device)
+        if isinstance(bound, tuple)
+        else torch.full((task.action_dim,), bound, device=device)
+        for bound in (task.action_low, task.action_high)
+    )
+    return low, high
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,13 @@
-"""Checkpoints: read with every byte checked, and refused in one line if anything is wrong."""
+"""Checkpoints: kept as asked, and read with every byte checked, or refused in one line."""
 
 from __future__ import annotations
 
+import math
 import pickle
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,24 @@ import torch
 
 from torchrl_l1.algorithms import Algorithm
 from torchrl_l1.experiment.errors import RunDirectoryError
+from torchrl_l1.experiment.files import copy_in_place
+
+KEPT = "checkpoints"
+"""Folder in a run directory of the checkpoints that a recipe keeps."""
+
+
+@dataclass
+class CheckpointSettings:
+    """Checkpoints that are kept, beside the last one and the one before it.
+
+    Attributes:
+        every: outer iterations after which one is kept, again and again; none if null.
+        best: whether that of the highest ``return_mean`` is kept.
+    """
+
+    every: int | None = None
+    best: bool = False
+
 
 _ENTRIES = {"algorithm": dict, "metrics": list, "timings": list}
 
@@ -88,3 +108,31 @@ def load_state(algorithm: Algorithm, state: dict[str, Any], file: Path) -> None:
     except Exception as error:
         why = " ".join(str(error).split())[:200]
         raise RunDirectoryError(f"{file} does not fit the run: {why}") from error
+
+
+def keep_checkpoints(
+    last: Path, settings: CheckpointSettings, rows: Sequence[Mapping[str, Any]]
+) -> None:
+    """Keep the last checkpoint, where it is one that a recipe keeps, in the folder :data:`KEPT`.
+
+    Args:
+        last: the run's last checkpoint.
+        settings: which are kept.
+        rows: rows of the metrics, as in that checkpoint.
+    """
+    names = []
+    if settings.every is not None and rows and len(rows) % settings.every == 0:
+        names.append(f"after_{len(rows)}.pt")
+    returns = [float(row["return_mean"]) for row in rows]
+    known = [value for value in returns if not math.isnan(value)]
+    if settings.best and known and returns.index(max(known)) == len(rows) - 1:
+        names.append("best.pt")
+    for name in names:
+        copy_in_place(last, last.parent / KEPT / name)
+
+
+def kept_by(path: Path) -> Path | None:
+    """The run directory that a kept checkpoint is of; ``None`` if a path is no such file."""
+    if path.suffix != ".pt" or path.parent.name != KEPT or path.is_dir():
+        return None
+    return path.parent.parent

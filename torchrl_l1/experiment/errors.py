@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
@@ -19,6 +21,24 @@ class RunDirectoryError(Exception):
 
 class RunDirectoryInUse(RunDirectoryError):
     """Another process is running in the run directory."""
+
+
+@contextmanager
+def fitting_into_memory(what: str) -> Iterator[None]:
+    """Say in a line what is too large for this machine, as sizes in a file may be.
+
+    Raises:
+        ValueError: if memory cannot be had in the block.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "allocate memory" not in str(error):
+            raise
+        raise ValueError(
+            f"{what} does not fit into the memory of this machine; look at the sizes of its "
+            "networks and data (model.hidden, model.members, policy.hidden, horizon)"
+        ) from error
 
 
 USER_ERRORS = (
@@ -46,6 +66,7 @@ _REMEDIES = {
     errno.ENOTEMPTY: "something is in the way; move it away",
     errno.ELOOP: "a symbolic link is in the way; remove it",
     errno.EMFILE: "too many files are open; raise the limit (ulimit -n)",
+    errno.EFBIG: "raise the limit on the size of files (ulimit -f), and the same command goes on",
     errno.EIO: "the disk fails; choose another place",
 }
 _LONGEST = 2000

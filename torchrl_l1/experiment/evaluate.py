@@ -24,15 +24,15 @@ from torchrl_l1.algorithms.policy import kinds_of
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import calibrate_filter
 from torchrl_l1.dynamics.fit import one_step_residuals
-from torchrl_l1.envs import DISTURBANCES, Perturbation
-from torchrl_l1.experiment.checkpoints import load_state
-from torchrl_l1.experiment.errors import RunDirectoryError, message
+from torchrl_l1.envs import DISTURBANCES, AnyTask, ExternalTask, Perturbation
+from torchrl_l1.experiment.checkpoints import KEPT, kept_by, load_state
+from torchrl_l1.experiment.errors import RunDirectoryError, fitting_into_memory, message
 from torchrl_l1.experiment.l1_options import (
     closest_option,
     l1_option,
     same_controller,
 )
-from torchrl_l1.experiment.matrix import Condition
+from torchrl_l1.experiment.matrix import Condition, disturbed
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run_directory import RunDirectory, read_config
 from torchrl_l1.experiment.settings import L1Settings, RunSettings, l1_config, schema_of
@@ -40,11 +40,24 @@ from torchrl_l1.experiment.settings import L1Settings, RunSettings, l1_config, s
 
 @dataclass
 class TrainedRun:
-    """A finished or running training, loaded for evaluation."""
+    """A finished or running training, loaded for evaluation.
+
+    Attributes:
+        path: the run directory.
+        recipe: its settings.
+        algorithm: with the state of a checkpoint.
+        checkpoint: name of a kept one; empty for the last.
+    """
 
     path: Path
     recipe: RunSettings
     algorithm: Algorithm
+    checkpoint: str = ""
+
+    @property
+    def name(self) -> str:
+        """As users name it: the run directory, or the file of the kept checkpoint."""
+        return str(self.path / KEPT / f"{self.checkpoint}.pt" if self.checkpoint else self.path)
 
     def stage(self, name: str | None) -> str:
         """The name of a stage that the run has reached; of the last one if ``None``.
@@ -67,16 +80,20 @@ def load_run(path: str | Path, *, last: bool = False) -> TrainedRun:
     """Load recipe, model and policy of a run directory.
 
     Args:
-        path: the directory.
+        path: the directory, or one of the checkpoints that it keeps, such as
+            ``RUN_DIR/checkpoints/best.pt``.
         last: whether the checkpoint before the last one will not do where that cannot be read.
 
     Raises:
         RunDirectoryError: if the directory holds no run, or no checkpoint that can be read.
     """
-    directory = RunDirectory(path)
+    kept = kept_by(Path(path))
+    directory = RunDirectory(path if kept is None else kept)
     if not directory.config_file.exists():
-        raise RunDirectoryError(f"{path} holds no run: there is no {directory.config_file.name}")
-    checkpoint = directory.load_checkpoint()
+        raise RunDirectoryError(
+            f"{directory.path} holds no run: there is no {directory.config_file.name}"
+        )
+    checkpoint = directory.load_checkpoint() if kept is None else directory.load_kept(Path(path))
     if checkpoint is not None and last and not directory.last_is_good:
         raise RunDirectoryError(
             f"{directory.checkpoint_file} cannot be read; resume the run, which makes it again"
@@ -87,11 +104,12 @@ def load_run(path: str | Path, *, last: bool = False) -> TrainedRun:
     here: dict[str, Any] = {"device": "cpu"}
     if hasattr(recipe, "compile_plans"):
         here["compile_plans"] = False  # as "auto" decides on the CPU
-    algorithm = replace(recipe, **here).build()
+    with fitting_into_memory(str(path)):
+        algorithm = replace(recipe, **here).build()
     state = checkpoint["algorithm"]
     load_state(algorithm, {**state, "buffer": {}}, directory.checkpoint_file)
     _measure_residuals(algorithm, state.get("buffer", {}), recipe)
-    return TrainedRun(directory.path, recipe, algorithm)
+    return TrainedRun(directory.path, recipe, algorithm, Path(path).stem if kept else "")
 
 
 def _recipe(directory: RunDirectory) -> RunSettings:
@@ -176,11 +194,12 @@ def evaluate_episodes(
     Raises:
         ValueError: for a stage that the run has not, before anything is evaluated.
     """
+    check_plants(trained.algorithm.task, cells)
     for cell in [replace(cell, stage=trained.stage(cell.stage)) for cell in cells]:
         collection = make_collection(trained, cell, episodes)
         data = collection.evaluate(seed, deterministic=cell.policy == "deterministic")
         place = {
-            "run": str(trained.path),
+            "run": trained.name,
             "training_seed": trained.recipe.seed,
             **_columns(trained, cell),
         }
@@ -201,6 +220,19 @@ def evaluate_episodes(
         )
 
 
+def check_plants(task: AnyTask, cells: Sequence[Condition]) -> None:
+    """Refuse changes of a plant that cannot be reached.
+
+    Raises:
+        ValueError: naming disturbance and environment.
+    """
+    if not isinstance(task, ExternalTask):
+        return
+    for cell in cells:
+        changed = disturbed(cell.disturbances)
+        task.check_disturbances([n for n in changed if DISTURBANCES[n].acts_on == "plant"])
+
+
 def episodes_file(table: Path) -> Path:
     """Where the rows of single episodes are that belong to a table in ``RUN_DIR/evaluations``."""
     return table.parent / "episodes" / table.name
@@ -216,7 +248,7 @@ def make_collection(trained: TrainedRun, cell: Condition, episodes: int) -> Coll
         episodes,
         trained.algorithm.policies[trained.stage(cell.stage)],
         trained.algorithm.acting_dynamics,
-        ORACLE if settings is None else l1_config(settings, trained.recipe.task),
+        ORACLE if settings is None else l1_config(settings, trained.algorithm.task),
         perturbation,
         trained.recipe.horizon,
     )
@@ -233,7 +265,7 @@ def _is_own(trained: TrainedRun, cell: Condition) -> bool:
     """Whether the controller of a test is the one that the run was trained with."""
     if cell.l1 == ORACLE:
         return False
-    return same_controller(_tested_l1(trained, cell), trained.recipe.l1, trained.recipe.task)
+    return same_controller(_tested_l1(trained, cell), trained.recipe.l1, trained.algorithm.task)
 
 
 def _tested_l1(trained: TrainedRun, cell: Condition) -> L1Settings:
@@ -244,7 +276,7 @@ def _tested_l1(trained: TrainedRun, cell: Condition) -> L1Settings:
     for either.
     """
     own = trained.recipe.l1
-    if cell.l1 == closest_option(own, trained.recipe.task):
+    if cell.l1 == closest_option(own, trained.algorithm.task):
         settings = own
     else:
         settings = replace(l1_option(cell.l1), epsilon=own.epsilon)

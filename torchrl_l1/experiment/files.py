@@ -8,7 +8,7 @@ import io
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import torch
 import yaml  # type: ignore[import-untyped]
 from filelock import lock_descriptor, unlock_descriptor
 
+from torchrl_l1.atomic import NO_FOLLOW, keep_file, write_atomically
 from torchrl_l1.experiment.errors import RunDirectoryError
 
 LONGEST_NAME = 120
@@ -27,9 +28,6 @@ _DIGEST = 10
 
 # A recipe has a few hundred entries; what aliases make of a small file may not fit into memory.
 _MOST_YAML_BYTES, _MOST_YAML_ENTRIES = 500_000, 50_000
-
-# Links are followed where a system lacks these, as Windows does, where few may make any.
-_NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
 
 
 def digest(text: str | bytes, length: int = 16) -> str:
@@ -53,6 +51,16 @@ def bounded(name: str, longest: int = LONGEST_NAME) -> str:
     return f"{kept}_{digest(name, _DIGEST)}"
 
 
+def path_text(text: str) -> str:
+    """A text as a part of a path: what separates folders becomes an underscore.
+
+    Examples:
+        >>> path_text("task=gymnasium/Reacher-v5")
+        'task=gymnasium_Reacher-v5'
+    """
+    return re.sub(r"[/\\:]", "_", text)
+
+
 def bounded_overrides(dirname: str) -> str:
     """Hydra's name for a list of overrides, with the shortest of them and a digest if it is long.
 
@@ -60,9 +68,12 @@ def bounded_overrides(dirname: str) -> str:
         >>> bounded_overrides("l1=off,noise=action")
         'l1=off,noise=action'
     """
+    parts = [
+        path_text(part) if part.startswith("task=") else part
+        for part in re.split(r",(?=[\w+~][\w.@/+~-]*=)", dirname)
+    ]
     if len(dirname.encode()) <= _LONGEST_OVERRIDES:
-        return dirname
-    parts = re.split(r",(?=[\w+~][\w.@/+~-]*=)", dirname)
+        return ",".join(parts)
     kept: set[int] = set()
     length = 0
     for index in sorted(range(len(parts)), key=lambda index: len(parts[index])):
@@ -108,7 +119,7 @@ def locked(file: Path, mode: str = "a") -> Iterator[bool]:
         raise RunDirectoryError(f"{file} is in the way of a file; remove it")
 
     def opener(path: str, flags: int) -> int:
-        return os.open(path, flags | _NO_FOLLOW, 0o666)
+        return os.open(path, flags | NO_FOLLOW, 0o666)
 
     with open(file, mode, encoding="utf-8", opener=opener) as handle:
         ours = lock_descriptor(handle.fileno(), blocking=False)
@@ -134,46 +145,21 @@ def write_table(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     write_atomically(file, table_text(rows))
 
 
-def write_atomically(file: Path, content: str | bytes, keep: Path | None = None) -> None:
-    """Replace a file in one step.
-
-    The target, and what an earlier attempt may have left beside it, are replaced where they are
-    links: nothing is written through them.
-
-    Args:
-        file: the file.
-        content: all of it.
-        keep: where the file stays that is replaced; there is one or the other at any moment.
+def copy_in_place(file: Path, at: Path) -> None:
+    """Make a copy of a file that is replaced as a whole and never changed; it takes no room.
 
     Raises:
-        OSError: with the name of the file, which is as it was.
+        RunDirectoryError: if the copy's folder is a link.
+        OSError: with the name of the copy.
     """
-    temporary = file.with_name(file.name + ".tmp")
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_FOLLOW | getattr(os, "O_BINARY", 0)
+    refuse_link(at.parent)
     try:
-        temporary.unlink(missing_ok=True)
-        with os.fdopen(os.open(temporary, flags, 0o666), "wb") as handle:
-            handle.write(content.encode() if isinstance(content, str) else content)
-            handle.flush()
-            os.fsync(handle.fileno())
-        if keep is not None and file.exists():
-            _keep(file, keep)
-        os.replace(temporary, file)
+        if at.exists() and os.path.samefile(file, at):
+            return
+        at.parent.mkdir(exist_ok=True)
+        keep_file(file, at, moved=False)
     except OSError as error:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise type(error)(error.errno, error.strerror, str(file)) from error
-
-
-def _keep(file: Path, at: Path) -> None:
-    second = at.with_name(at.name + ".tmp")
-    second.unlink(missing_ok=True)
-    try:
-        os.link(file, second)
-    except OSError:  # a file system without hard links
-        os.replace(file, at)
-    else:
-        os.replace(second, at)
+        raise type(error)(error.errno, error.strerror, str(at)) from error
 
 
 def saved(state: object) -> bytes:

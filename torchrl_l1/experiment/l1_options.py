@@ -9,6 +9,9 @@ from functools import cache
 from typing import Any
 
 from torchrl_l1.algorithms.collection import ORACLE
+from torchrl_l1.control.config import DEFAULT_ALPHA
+from torchrl_l1.envs import AnyTask
+from torchrl_l1.envs.tasks import is_plain
 from torchrl_l1.experiment.recipes import group_options, group_setting
 from torchrl_l1.experiment.settings import L1Settings, l1_config
 
@@ -59,8 +62,11 @@ def check_tested(names: Iterable[str]) -> None:
             raise ValueError(f"unknown l1 setting {name!r}; there are {', '.join(there)}")
 
 
-def filter_gain(settings: L1Settings, task: str) -> float:
+def filter_gain(settings: L1Settings, task: str | AnyTask) -> float:
     """Gain per step of the low-pass filter, however it was given.
+
+    Of an environment of elsewhere that is only named, it is the cutoff in rad/s where that was
+    given: nothing is run to learn the time of a step.
 
     Raises:
         KeyError: for an unknown task, whose time step a ``cutoff`` needs.
@@ -72,13 +78,16 @@ def filter_gain(settings: L1Settings, task: str) -> float:
         >>> filter_gain(L1Settings(cutoff=8.75), "inverted_pendulum")
         0.35
     """
+    if isinstance(task, str) and not is_plain(task):
+        gain = settings.alpha if settings.cutoff is None else settings.cutoff
+        return DEFAULT_ALPHA if gain is None else gain
     config = l1_config(replace(settings, enabled=True), task)
     assert config is not None
     # The product of cutoff and time step differs from a written alpha in its last digit.
     return float(f"{config.filter_gain:.9g}")
 
 
-def departures(settings: L1Settings, option: str, task: str) -> dict[str, Any]:
+def departures(settings: L1Settings, option: str, task: str | AnyTask) -> dict[str, Any]:
     """In what a controller departs from a shipped option, with its values.
 
     Epsilon and compilation do not count, and the filter counts by its gain, as ``alpha``.
@@ -97,7 +106,7 @@ def departures(settings: L1Settings, option: str, task: str) -> dict[str, Any]:
     return found if gain == filter_gain(shipped, task) else {**found, "alpha": gain}
 
 
-def closest_option(settings: L1Settings, task: str, *, by_filter: bool = True) -> str:
+def closest_option(settings: L1Settings, task: str | AnyTask, *, by_filter: bool = True) -> str:
     """The shipped option that a controller departs least from.
 
     Args:
@@ -124,7 +133,7 @@ def closest_option(settings: L1Settings, task: str, *, by_filter: bool = True) -
     return min((name for name, values in l1_options().items() if values.enabled), key=distance)
 
 
-def same_controller(one: L1Settings, other: L1Settings, task: str) -> bool:
+def same_controller(one: L1Settings, other: L1Settings, task: str | AnyTask) -> bool:
     """Whether two settings make the same controller, compiled or not.
 
     Filters are compared by their gain; controllers that are off are the same.

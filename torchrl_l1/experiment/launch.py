@@ -7,6 +7,7 @@ import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, suppress
+from dataclasses import fields
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -15,20 +16,29 @@ import yaml  # type: ignore[import-untyped]
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import IntervalSweep
 from hydra.errors import CompactHydraException, HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_l1.envs.references import folders_of
 from torchrl_l1.experiment.errors import USER_ERRORS, RecipeError, message
-from torchrl_l1.experiment.files import problem, yaml_text
+from torchrl_l1.experiment.files import bounded, problem, yaml_text
 from torchrl_l1.experiment.recipes import (
     available_recipes,
     find_recipe,
     recipes_dir,
     shared_dir,
 )
-from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.settings import SCHEMAS, check_known, flatten, register
+from torchrl_l1.experiment.run import final_return, run
+from torchrl_l1.experiment.settings import SCHEMAS, WandbSettings, check_known, flatten, register
+
+# What does not tell results apart, or is named in another way.
+_IN_NO_NAME = (
+    *("seed", "run_dir", "resume", "recipe", "loggers", "checkpoint.every", "checkpoint.best"),
+    "search_path",
+    *(f"wandb.{part.name}" for part in fields(WandbSettings)),
+)
 
 # The run directory is ours to open, so Hydra must not create or write to it first.
 _HYDRA_SETTINGS = [
@@ -38,7 +48,9 @@ _HYDRA_SETTINGS = [
     "hydra.sweep.subdir=.",
     "hydra/job_logging=disabled",
     "hydra/hydra_logging=disabled",
-    "hydra.job.config.override_dirname.exclude_keys=[seed,run_dir,resume,wandb.mode]",
+    # The project stays where it was: directories of older runs are found again.
+    "hydra.job.config.override_dirname.exclude_keys="
+    f"[{','.join(key for key in _IN_NO_NAME if key != 'wandb.project')}]",
 ]
 
 _FLAGS_WITH_VALUE = (
@@ -71,9 +83,13 @@ def launch(name: str, arguments: Sequence[str]) -> None:
     register()
     flags, overrides = split_flags([text for text in arguments if text != "--trust"])
     if not any(flag.partition("=")[0] in _OWN_WAYS for flag in flags):
-        _check(recipe, overrides, "-m" in flags or "--multirun" in flags, "--trust" in arguments)
+        config = _check(
+            recipe, overrides, "-m" in flags or "--multirun" in flags, "--trust" in arguments
+        )
+        overrides += _search_path_override(recipe, config, overrides)
     before = sys.argv
-    sys.argv = ["torchrl-l1", *flags, *_search_path(recipe), *_HYDRA_SETTINGS, *overrides]
+    settings = [*_search_path(recipe), *_HYDRA_SETTINGS]
+    sys.argv = ["torchrl-l1", *flags, *settings, *overrides, *_name(recipe, overrides)]
     try:
         with redirect_stderr(cast(IO[str], _WithoutOverrides())):
             hydra.main(version_base="1.3", config_path=str(recipe.parent), config_name=recipe.stem)(
@@ -98,15 +114,15 @@ class _WithoutOverrides:
         return getattr(self._stream, name)
 
 
-def _check(recipe: Path, overrides: Sequence[str], sweeps: bool, trusted: bool) -> None:
-    """Compose the first run and refuse what Hydra would tell at length, or not at all."""
+def _check(recipe: Path, overrides: Sequence[str], sweeps: bool, trusted: bool) -> DictConfig:
+    """Compose the first run, and refuse what Hydra would tell at length, or not at all."""
     if not trusted:
         check_data(recipe)
     settings = [*_search_path(recipe), *_HYDRA_SETTINGS]
     try:
         with _composing(recipe.parent):
             first = _first(overrides) if sweeps else list(overrides)
-            config = _composed(recipe.stem, [*settings, *first])
+            config = _composed(recipe.stem, [*settings, *first, *_name(recipe, overrides)])
         if not trusted and not recipe.is_relative_to(recipes_dir()):
             of_hydra = [
                 text for text in first if text.lstrip("+~").startswith(("hydra.", "hydra/"))
@@ -122,6 +138,13 @@ def _check(recipe: Path, overrides: Sequence[str], sweeps: bool, trusted: bool) 
     except (yaml.YAMLError, RecursionError, OverflowError, TypeError) as error:
         raise RecipeError(f"{recipe}, or what it includes: {problem(error)}") from error
     check_known(config)
+    for text in overrides:
+        if "interval(" in text and config.hydra.sweeper._target_.endswith(".BasicSweeper"):
+            raise RecipeError(
+                f"{text}: only a sweeper such as hydra/sweeper=optuna chooses from an interval; "
+                "name values, or give that sweeper"
+            )
+    return config
 
 
 @contextmanager
@@ -144,7 +167,12 @@ def _first(overrides: Sequence[str]) -> list[str]:
     found = []
     for text, override in zip(overrides, parser.parse_overrides(list(overrides)), strict=True):
         if override.is_sweep_override():
-            values = list(override.sweep_string_iterator())
+            interval = override.value()
+            # A sweeper chooses from an interval; what lies at its start will do here.
+            if isinstance(interval, IntervalSweep):
+                values = [str(interval.start)]
+            else:
+                values = list(override.sweep_string_iterator())
             if not values:
                 raise RecipeError(f"{text} matches nothing, so there is nothing to run")
             text = f"{override.get_key_element()}={values[0]}"
@@ -175,6 +203,27 @@ def check_data(recipe: Path) -> None:
         "hydra/" in text or "@hydra" in text for text in named
     ):
         raise _no_data(recipe, "has a section hydra")
+    _check_defaults(recipe, defaults)
+
+
+def _check_defaults(recipe: Path, texts: Any) -> None:
+    """Tell an option that YAML takes for true or false by its name: ``off`` is one of L1's."""
+    try:
+        content = yaml.safe_load(yaml_text(recipe))
+    except yaml.YAMLError:
+        return  # Hydra says what is wrong with it
+    entries = content.get("defaults")
+    if not (isinstance(entries, list) and isinstance(texts, list)):
+        return
+    for entry, text in zip(entries, texts, strict=False):
+        if not (isinstance(entry, dict) and isinstance(text, dict)):
+            continue
+        for value, (key, word) in zip(entry.values(), text.items(), strict=False):
+            if isinstance(value, bool):
+                raise RecipeError(
+                    f"{recipe}: defaults: {key}: {word} means {str(value).lower()} in YAML; write "
+                    f"{key}: '{word}'"
+                )
 
 
 def _check_hydra(recipe: Path, config: DictConfig, bare: DictConfig) -> None:
@@ -226,7 +275,49 @@ def compose(name: str, overrides: Sequence[str] = (), *, trusted: bool = False) 
     if not trusted:
         check_data(recipe)
     with _composing(recipe.parent):
-        return hydra.compose(recipe.stem, [*_search_path(recipe), *overrides])
+        own = [*overrides, *_name(recipe, overrides)]
+        config = hydra.compose(recipe.stem, [*_search_path(recipe), *own])
+    if "search_path" in config and not config.search_path:
+        config.search_path = _folders_of_code(recipe, config, overrides)
+    return config
+
+
+def _name(recipe: Path, overrides: Sequence[str]) -> list[str]:
+    """The name of a user's recipe that has none of its own, as an override: that of its file."""
+    if recipe.is_relative_to(recipes_dir()) or any(
+        text.startswith("recipe=") for text in overrides
+    ):
+        return []
+    try:
+        content = yaml.load(yaml_text(recipe), yaml.BaseLoader)
+    except (yaml.YAMLError, OSError, ValueError, RecursionError):
+        return []  # Hydra says what is wrong with it
+    named = not isinstance(content, dict) or "recipe" in content
+    stem = recipe.stem.replace("'", "\\'")
+    return [] if named else [f"recipe='{stem}'"]
+
+
+# Keys that may name code of the user's.
+_NAMING = ("task", "reward", "termination")
+
+
+def _search_path_override(recipe: Path, config: DictConfig, overrides: Sequence[str]) -> list[str]:
+    """The folders of what a recipe names, told to every process that runs a part of it."""
+    if config.get("search_path"):
+        return []
+    folders = _folders_of_code(recipe, config, overrides)
+    quoted = ",".join("'" + folder.replace("'", "\\'") + "'" for folder in folders)
+    return [f"search_path=[{quoted}]"] if folders else []
+
+
+def _folders_of_code(recipe: Path, config: DictConfig, overrides: Sequence[str]) -> list[str]:
+    """Folders with modules and files that settings name: that of the recipe, or where we are."""
+    given = [text.partition("=") for text in overrides]
+    names = [name for key, _, value in given if key in _NAMING for name in value.split(",")]
+    values = (OmegaConf.select(config, key) for key in _NAMING)
+    names += [str(value) for value in values if value is not None]
+    own = [] if recipe.is_relative_to(recipes_dir()) else [recipe.parent]
+    return folders_of(names, [*own, Path.cwd()])
 
 
 def _search_path(recipe: Path) -> list[str]:
@@ -260,9 +351,13 @@ def _included(recipe: Path) -> list[str]:
     return [name.partition("@")[0].removeprefix("/") for name in names]
 
 
-def _task(config: DictConfig) -> None:
+def _task(config: DictConfig) -> float:
+    """Run a composed recipe; what a sweeper that looks for good settings is told of it."""
     try:
-        run(config)
+        check_known(config)
+        if config.wandb.name is None:
+            config.wandb.name = _shown(config)
+        return final_return(run(config))
     except USER_ERRORS as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
@@ -272,3 +367,10 @@ def _task(config: DictConfig) -> None:
             raise CompactHydraException(line) from error
         print(line, file=sys.stderr)
         sys.exit(1)
+
+
+def _shown(config: DictConfig) -> str:
+    """A name for loggers that tells arms apart: the recipe, what differs from it, and the seed."""
+    overrides = HydraConfig.get().overrides.task
+    differs = [text for text in overrides if text.lstrip("+~").split("=")[0] not in _IN_NO_NAME]
+    return bounded(" ".join([config.recipe, *differs, f"seed={config.seed}"]))

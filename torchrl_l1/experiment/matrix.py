@@ -20,7 +20,7 @@ from torchrl_l1.experiment.settings import SCHEMAS
 
 _STAGES = [stage.name for one in SCHEMAS.values() for stage in one.builds.facts.named_stages]
 
-SUITE_L1 = (OFF, "paper", ORACLE)
+SUITE_L1 = (OFF, "paper", "robust", ORACLE)
 """Options of ``l1`` that a suite is tested with where none are given."""
 
 # Key of the metadata of a field.

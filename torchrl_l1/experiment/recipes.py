@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -84,11 +85,40 @@ def find_campaign(name: str) -> Path:
     return _find("campaign", name, available_campaigns(), recipes_dir() / "campaigns")
 
 
+def copy_recipe(name: str, file: str | None = None) -> Path:
+    """Copy a shipped recipe or campaign to where it can be edited.
+
+    Args:
+        name: such as ``pets/half_cheetah`` or ``table1``.
+        file: the copy, a ``.yaml``; by default it is named like the recipe, in the current folder.
+
+    Returns:
+        the copy, which runs, under a name of its own.
+
+    Raises:
+        RecipeError: if there is no such recipe, or something is in the copy's place.
+    """
+    source = find_campaign(name) if name in available_campaigns() else find_recipe(name)
+    copy = Path(file or f"{name.replace('/', '_')}.yaml")
+    if copy.suffix != ".yaml" or not copy.stem.strip("."):
+        raise RecipeError(f"the copy's name must end in .yaml, got {copy}")
+    text = source.read_text(encoding="utf-8")
+    text = re.sub(r"(?m)^recipe: \S+$", f"recipe: {copy.stem}", text)
+    try:
+        with copy.open("x", encoding="utf-8") as handle:
+            handle.write(text)
+    except FileExistsError:
+        raise RecipeError(f"{copy} is there already; give another FILE") from None
+    return copy
+
+
 def _find(kind: str, name: str, available: list[str], folder: Path) -> Path:
     own = Path(name)
     if own.suffix == ".yaml":
         if not own.is_file():
-            raise RecipeError(f"{kind} file {name} does not exist")
+            other = own.with_suffix(".yml")
+            hint = f"; rename {other}, names must end in .yaml" if other.is_file() else ""
+            raise RecipeError(f"{kind} file {name} does not exist{hint}")
         if not own.stem.strip("."):
             raise RecipeError(f"{kind} file {name} has no name but its dots; rename it")
         return own.resolve()
@@ -97,6 +127,8 @@ def _find(kind: str, name: str, available: list[str], folder: Path) -> Path:
     if name not in available:
         close = get_close_matches(name, available, n=1)
         hint = f" Did you mean {close[0]}?" if close else ""
+        if Path(f"{name}.yaml").is_file():
+            hint = f" Did you mean the file {name}.yaml?"
         raise RecipeError(
             f"unknown {kind} {name!r}.{hint} Available: {', '.join(available)}; "
             "or give the path of a .yaml file."

@@ -2,87 +2,26 @@
 
 from __future__ import annotations
 
-import hashlib
+import csv
 import logging
-import os
+import math
 import sys
-from collections.abc import Mapping
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import torch
-import wandb
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_l1.algorithms import Algorithm
 from torchrl_l1.algorithms.algorithm import Diverged, IterationResult
-from torchrl_l1.experiment.checkpoints import checkpoint_of, load_state
-from torchrl_l1.experiment.errors import RunDirectoryError
+from torchrl_l1.experiment.checkpoints import checkpoint_of, keep_checkpoints, load_state
+from torchrl_l1.experiment.errors import RunDirectoryError, fitting_into_memory
 from torchrl_l1.experiment.files import refuse_link, write_atomically
-from torchrl_l1.experiment.run_directory import RunDirectory, versions
-from torchrl_l1.experiment.settings import RunSettings, check_known
+from torchrl_l1.experiment.run_directory import RunDirectory, read_config, versions
+from torchrl_l1.experiment.settings import RunSettings, check_known, schema_of
 from torchrl_l1.experiment.signals import RESUME_ME, asked_to_make_room
-
-MODES = ("auto", "online", "offline", "disabled")
-
-
-class Tracker:
-    """Thin wrapper that chooses the mode and keeps a resumed run under its first id.
-
-    Args:
-        mode: ``auto`` is online when an API key is configured and offline otherwise.
-        project: W&B project.
-        config: the full resolved configuration, with versions.
-        directory: where W&B puts its files.
-        run_id: identifier of the run, the same before and after a resume.
-
-    Raises:
-        ValueError: for an unknown mode.
-    """
-
-    def __init__(
-        self, mode: str, project: str, config: Mapping[str, Any], directory: Path, run_id: str
-    ) -> None:
-        check_wandb_mode(mode)
-        if mode == "auto":
-            # An explicit WANDB_MODE, as users set it on clusters, has the last word.
-            mode = os.environ.get("WANDB_MODE") or ("online" if _logged_in() else "offline")
-        self._run = wandb.init(
-            mode=mode,  # type: ignore[arg-type]
-            project=project,
-            config=dict(config),
-            dir=str(directory),
-            id=run_id,
-            name=str(config.get("recipe", "run")) + f" seed {config.get('seed')}",
-            resume="allow" if mode == "online" else None,
-            settings=wandb.Settings(silent=True, console="off"),
-        )
-
-    def log(self, metrics: Mapping[str, Any], timing: Mapping[str, Any]) -> None:
-        """Log one outer iteration as one dictionary."""
-        seconds = {f"seconds/{phase}": value for phase, value in timing.items()}
-        del seconds["seconds/iteration"]
-        self._run.log({**metrics, **seconds}, step=int(metrics["iteration"]))
-
-    def close(self) -> None:
-        """Flush and close."""
-        self._run.finish()
-
-
-def _logged_in() -> bool:
-    try:
-        return bool(wandb.login(prompt=False))
-    except wandb.errors.Error:
-        # A key without a network that would accept it: nothing is lost offline.
-        return False
-
-
-def check_wandb_mode(mode: str) -> None:
-    """Raise a ``ValueError`` for an unknown mode."""
-    if mode not in MODES:
-        raise ValueError(f"wandb.mode must be one of {', '.join(MODES)}, got {mode!r}")
+from torchrl_l1.experiment.tracking import check_loggers, lacks, trackers
 
 
 def run(config: DictConfig) -> Path:
@@ -104,7 +43,7 @@ def run(config: DictConfig) -> Path:
     recipe = OmegaConf.to_object(config)
     assert isinstance(recipe, RunSettings)
     settings = {str(key): value for key, value in resolved.items()}
-    check_wandb_mode(recipe.wandb.mode)
+    check_loggers(recipe)
     torch.set_num_threads(recipe.threads)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     progress = tqdm(
@@ -114,16 +53,39 @@ def run(config: DictConfig) -> Path:
         disable=None,
     )
     with progress:
-        algorithm = recipe.build()
+        with fitting_into_memory(recipe.recipe):
+            algorithm = recipe.build()
         algorithm.on_phase = lambda phase: progress.set_postfix_str(phase)
         directory = RunDirectory(recipe.run_dir)
-        refuse_link(directory.path / "wandb")
+        for folder in ("wandb", "tensorboard", "checkpoints"):
+            refuse_link(directory.path / folder)
         if not (recipe.resume and directory.checkpoint_file.exists()):
             algorithm.prepare()
         with directory.open(settings, recipe.resume):
             _run(algorithm, recipe, settings, directory, progress)
     print(f"Finished: {directory.metrics_file}")
     return directory.path
+
+
+def final_return(run_dir: str | Path) -> float:
+    """Return of a run by the paper's rule: the mean over the last outer iterations.
+
+    With several stages they are of the last one only. NaN if there are none yet.
+
+    Args:
+        run_dir: a run directory.
+    """
+    directory = RunDirectory(run_dir)
+    with directory.metrics_file.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    if not rows:
+        return math.nan
+    facts = schema_of(read_config(directory.config_file)).builds.facts
+    # Where there is only one stage, metrics do not count it.
+    position = int(rows[-1]["stage"]) - 1 if facts.named_stages else 0
+    ending = [row for row in rows if row.get("stage") == rows[-1].get("stage")]
+    returns = [float(row["return_mean"]) for row in ending[-facts.stages[position].window :]]
+    return sum(returns) / len(returns)
 
 
 def _run(
@@ -146,27 +108,20 @@ def _run(
             if restored:
                 names = ", ".join(restored)
                 progress.write(f"{directory.path}: written again from the checkpoint: {names}")
-        if len(rows) >= recipe.outer_iterations:
+            keep_checkpoints(directory.checkpoint_file, recipe.checkpoint, rows)
+        if len(rows) >= recipe.outer_iterations and not lacks(recipe, directory.path, rows):
             progress.write(f"{directory.path} is complete: nothing to do")
             return
-    run_id = hashlib.sha256(str(directory.path.resolve()).encode()).hexdigest()[:12]
-    tracker = Tracker(
-        recipe.wandb.mode,
-        recipe.wandb.project,
-        {**settings, "versions": versions(), "choices": dict(algorithm.choices())},
-        directory.path,
-        run_id,
-    )
+    config = {**settings, "versions": versions(), "choices": dict(algorithm.choices())}
     choices = (f"{name} {value}" for name, value in algorithm.choices().items())
     progress.write(f"{recipe.recipe}: {', '.join(choices)}")
-    with closing(tracker):
-        if rows:
-            # A kill may have come between the last checkpoint and its log entry.
-            tracker.log(rows[-1], timings[-1])
+    with trackers(recipe, directory.path, config, rows, timings, progress.write) as loggers:
         try:
             for result in algorithm.iterate():
                 _save(result, algorithm, settings, directory, rows, timings)
-                tracker.log(rows[-1], timings[-1])
+                keep_checkpoints(directory.checkpoint_file, recipe.checkpoint, rows)
+                for logger in loggers:
+                    logger.log(rows[-1], timings[-1])
                 progress.update()
                 progress.write(
                     f"iteration {len(rows) - 1}: {result.metrics['real_steps']} real steps, "

@@ -294,6 +294,16 @@ class RunDirectory:
             say(f"{problems[0]}; the run starts over")
         return state
 
+    def load_kept(self, file: Path) -> dict[str, Any]:
+        """A checkpoint that the run has kept.
+
+        Raises:
+            RunDirectoryError: if it cannot be read, or is of another configuration.
+        """
+        state = read_checkpoint(file)
+        self._check_checkpoint(file, state, self._stored(), lambda line: None)
+        return state
+
     def _has_results(self) -> bool:
         names = (*_TABLES, *_WEIGHTS)
         return any((self.path / n).exists() and (self.path / n).stat().st_size for n in names)
@@ -417,8 +427,10 @@ def differences(
     defaults = schema_defaults(now)
     before, now = flatten(before), flatten(now)
     before = {k: v for k, v in defaults.items() if k in now} | before
-    if may_grow and before.get(_MAY_GROW, 0) < now.get(_MAY_GROW, 0):
-        before[_MAY_GROW] = now[_MAY_GROW]
+    had, has = before.get(_MAY_GROW, 0), now.get(_MAY_GROW, 0)
+    # A damaged configuration may hold anything.
+    if may_grow and isinstance(had, int) and isinstance(has, int) and had < has:
+        before[_MAY_GROW] = has
     return [
         f"{key}: {before.get(key, '(absent)')} there, {now.get(key, '(absent)')} now"
         for key in sorted(before.keys() | now.keys())

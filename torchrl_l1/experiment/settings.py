@@ -21,17 +21,20 @@ from torchrl_l1.algorithms import (
     METRPOConfig,
     Offline,
     OfflineConfig,
+    OutcomeConfig,
     Perturbation,
     PETSConfig,
 )
 from torchrl_l1.algorithms.algorithm import DEVICES
 from torchrl_l1.algorithms.metrpo_config import check_clipping
-from torchrl_l1.checks import check_choice, check_count, check_optional_count
+from torchrl_l1.algorithms.outcomes import check_outcome
+from torchrl_l1.checks import check_choice, check_count, check_optional_count, check_positive
 from torchrl_l1.compilation import check_mode
 from torchrl_l1.control import L1Config
-from torchrl_l1.envs import get_task
+from torchrl_l1.envs import AnyTask, get_task
+from torchrl_l1.experiment.checkpoints import CheckpointSettings
 from torchrl_l1.experiment.datasets import read_dataset
-from torchrl_l1.experiment.files import bounded_overrides
+from torchrl_l1.experiment.files import bounded_overrides, path_text
 
 
 @dataclass
@@ -89,10 +92,20 @@ class WandbSettings:
         mode: ``auto`` (online when logged in, else offline), ``online``, ``offline``,
             ``disabled``.
         project: name of the project.
+        entity: user or team; W&B's default if null.
+        group: that the run belongs to.
+        name: of the run; recipe, what differs from it, and seed if null.
+        tags: words to find it by.
+        notes: a longer text.
     """
 
     mode: str = "auto"
     project: str = "torchrl_l1"
+    entity: str | None = None
+    group: str | None = None
+    name: str | None = None
+    tags: list[str] = field(default_factory=list)
+    notes: str | None = None
 
 
 @dataclass
@@ -103,33 +116,52 @@ class RunSettings(ABC):
         algorithm: the algorithm's name, fixed by the recipe's schema.
         outer_iterations: rounds of the algorithm.
         recipe: the recipe's name, as given on the command line.
-        task: a task of :data:`torchrl_l1.envs.TASKS`.
+        task: a task of :data:`torchrl_l1.envs.TASKS`, or any environment by name, see
+            :func:`torchrl_l1.envs.environment_source`.
+        dt: seconds of a step, where an environment of elsewhere does not tell.
+        observation_keys: parts of the observation, where that of an environment comes in parts.
+        search_path: folders for files and modules that the recipe names; found as it is composed.
         seed: seed of every random stream.
         run_dir: where the run's files go; a long list of overrides is shortened in its name.
         resume: continue the run in ``run_dir`` from its last checkpoint.
         threads: CPU threads of torch.
         device: ``cpu``, ``cuda`` or ``auto`` (CUDA where there is one).
         horizon: steps per real episode; the task's own if null.
+        reward: of imagined trajectories: ``builtin``, the task's own; ``learned``, by a model that
+            is fitted with the dynamics; or ``MODULE:FUNCTION`` or ``FILE.py:FUNCTION``.
+        termination: of imagined trajectories, likewise, or ``none``. Where it is ``builtin``,
+            METRPO goes by ``imagined_termination``.
+        outcome_model: see :class:`~torchrl_l1.algorithms.OutcomeConfig`.
         on_divergence: ``stop`` or ``warn`` where losses, weights or plans are no longer finite.
+        loggers: of ``wandb`` and ``tensorboard``; none if empty.
         l1: see :class:`L1Settings`.
         perturbation: noise and disturbances of the real environment.
         wandb: see :class:`WandbSettings`.
+        checkpoint: see :class:`CheckpointSettings`.
     """
 
     algorithm: str = MISSING
     outer_iterations: int = MISSING
     recipe: str = MISSING
     task: str = MISSING
+    dt: float | None = None
+    observation_keys: list[str] = field(default_factory=list)
+    search_path: list[str] = field(default_factory=list)
     seed: int = 0
     run_dir: str = "runs/${recipe}/${bounded:${hydra:job.override_dirname}}/seed_${seed}"
     resume: bool = False
     threads: int = 1
     device: str = "cpu"
     horizon: int | None = None
+    reward: str = "builtin"
+    termination: str = "builtin"
+    outcome_model: OutcomeConfig = field(default_factory=OutcomeConfig)
     on_divergence: str = "stop"
+    loggers: list[str] = field(default_factory=lambda: ["wandb"])
     l1: L1Settings = field(default_factory=L1Settings)
     perturbation: Perturbation = field(default_factory=Perturbation)
     wandb: WandbSettings = field(default_factory=WandbSettings)
+    checkpoint: CheckpointSettings = field(default_factory=CheckpointSettings)
 
     builds: ClassVar[type[Algorithm]]
 
@@ -152,7 +184,12 @@ class RunSettings(ABC):
         check_choice("device", self.device, DEVICES)
         check_count("threads", self.threads)
         check_optional_count("horizon", self.horizon)
+        if self.dt is not None:
+            check_positive("dt", self.dt)
         check_choice("on_divergence", self.on_divergence, ("stop", "warn"))
+        check_optional_count("checkpoint.every", self.checkpoint.every)
+        check_outcome("reward", self.reward)
+        check_outcome("termination", self.termination)
 
     @abstractmethod
     def collected_episodes(self, iterations: int) -> int:
@@ -162,32 +199,54 @@ class RunSettings(ABC):
         """Names of the stages that ``outer_iterations`` reaches."""
         return self.builds.facts.stage_names
 
+    def real_task(self) -> AnyTask:
+        """What the recipe is about.
+
+        Raises:
+            KeyError: if there is no task of that name.
+            ValueError: for an environment that will not do, or does not tell what must be known.
+        """
+        return get_task(
+            self.task,
+            dt=self.dt,
+            horizon=self.horizon,
+            observation_keys=self.observation_keys,
+            search_path=self.search_path,
+        )
+
     def build(self) -> Algorithm:
         """The algorithm that the recipe describes, fresh.
 
         Raises:
             ValueError: if settings contradict each other.
         """
-        config = self.builds.config_class
+        config, task = self.builds.config_class, self.real_task()
         algorithm = self.builds(
-            self.task,
+            task,
             config(**{part.name: getattr(self, part.name) for part in fields(config)}),
-            l1_config(self.l1, self.task),
+            l1_config(self.l1, task),
             perturbation=self.perturbation,
             seed=self.seed,
             horizon=self.horizon,
             device=self.device,
             compile_l1=check_mode(self.l1.compile, "l1.compile"),
+            reward=self.reward,
+            termination=self.termination,
+            outcome_model=self.outcome_model,
+            search_path=self.search_path,
         )
         algorithm.stops_on_divergence = self.on_divergence == "stop"
         return algorithm
 
 
-# Not in ``register``: launchers resolve it in processes of their own.
+# Not in ``register``: launchers resolve them in processes of their own.
 OmegaConf.register_new_resolver("bounded", bounded_overrides, replace=True)
+OmegaConf.register_new_resolver("path_text", path_text, replace=True)
 
 # Keys that may differ between a run and its continuation: they do not touch the result.
-VOLATILE_KEYS = ("run_dir", "resume", "wandb", "on_divergence")
+VOLATILE_KEYS = (
+    *("run_dir", "resume", "wandb", "on_divergence", "loggers", "checkpoint", "search_path"),
+)
 
 
 def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
@@ -239,7 +298,7 @@ def _unknown(node: DictConfig, prefix: str, known: list[str]) -> list[str]:
     return found
 
 
-def l1_config(settings: L1Settings, task_name: str) -> L1Config | None:
+def l1_config(settings: L1Settings, task: str | AnyTask) -> L1Config | None:
     """The controller that a recipe asks for on a task; ``None`` if it is off.
 
     Raises:
@@ -247,7 +306,7 @@ def l1_config(settings: L1Settings, task_name: str) -> L1Config | None:
     """
     if not settings.enabled:
         return None
-    task = get_task(task_name)
+    task = get_task(task)
     return L1Config(
         dt=task.dt,
         epsilon=settings.epsilon,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -49,7 +50,10 @@ class TRPOConfig:
 
 @dataclass
 class TRPOReport:
-    """What a step did: surrogate improvement, KL reached, whether and after how many trials."""
+    """What a step did: surrogate improvement, KL reached, whether and after how many trials.
+
+    The KL divergence is no number where the curvature, or every candidate, is not finite.
+    """
 
     improvement: float
     kl: float
@@ -150,7 +154,9 @@ def take_step(problem: TrustRegionProblem, advantage: Tensor, config: TRPOConfig
     gradient = problem.gradient()
     direction = conjugate_gradient(product, gradient, config.cg_iterations)
     curvature = direction @ product(direction)
-    if not (torch.isfinite(curvature) and curvature > 0):
+    if not torch.isfinite(curvature):
+        return TRPOReport(improvement=0.0, kl=math.nan, accepted=False, backtracks=0)
+    if not curvature > 0:
         return TRPOReport(improvement=0.0, kl=0.0, accepted=False, backtracks=0)
     full_step = (2 * config.max_kl / curvature).sqrt() * direction
     start = parameters_to_vector(parameters).detach()
@@ -165,7 +171,9 @@ def take_step(problem: TrustRegionProblem, advantage: Tensor, config: TRPOConfig
             if enough and kl <= config.max_kl:
                 return TRPOReport(improvement.item(), kl.item(), True, trial)
         _write(start, parameters)
-    return TRPOReport(improvement=0.0, kl=0.0, accepted=False, backtracks=config.max_backtracks)
+    # Not even the shortest step leads to numbers: that is no step that was merely too long.
+    known = torch.isfinite(improvement) and torch.isfinite(kl)
+    return TRPOReport(0.0, 0.0 if known else math.nan, False, config.max_backtracks)
 
 
 def _write(vector: Tensor, parameters: list[Tensor]) -> None:

@@ -226,7 +226,12 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
         raise RunDirectoryError(f"cannot use {directory.config_file}: {message(error)}") from error
     if problem := directory.metrics_problem():
         raise RunDirectoryError(problem)
-    columns = read_metrics(directory.metrics_file, len(algorithm.named_stages))
+    try:
+        columns = read_metrics(directory.metrics_file, len(algorithm.named_stages))
+    except RunDirectoryError as error:
+        # Returns of no number enter no mean: it is left out, but the reason is told.
+        why = _diverged(directory.diverged_file)
+        raise RunDirectoryError(f"{error} ({why})" if why else str(error)) from error
     iterations = len(columns["iteration"])
     if iterations > identity.outer_iterations:
         raise RunDirectoryError(

@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from torchrl_l1.algorithms.collection import ORACLE
+from torchrl_l1.atomic import write_through
 from torchrl_l1.report.identity import BASELINE
 
 # Labels hold values from files: what stands between dollars is no formula.
@@ -93,7 +94,8 @@ def title(task: str, noise: str | None = None) -> str:
         >>> title("half_cheetah", "action")
         'Half cheetah, action noise'
     """
-    name = task.replace("_", " ").capitalize()
+    # Names of environments of elsewhere stay as they are.
+    name = task if re.search(r"[/:]", task) else task.replace("_", " ").capitalize()
     return name if noise is None else f"{name}, {noise_words(noise)}"
 
 
@@ -179,6 +181,8 @@ def legend_below(figure: Figure, axes: Sequence[Axes], last: Sequence[str] = ())
 
 def save(figure: Figure, file: Path) -> Path:
     """Write a figure and close it."""
-    figure.savefig(file, dpi=130)
+    write_through(
+        file, lambda buffer: figure.savefig(buffer, format=file.suffix[1:] or "png", dpi=130)
+    )
     plt.close(figure)
     return file

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any, TypeAlias
 
 import gymnasium
@@ -22,34 +18,32 @@ from torchrl.envs import (
     DMControlEnv,
     DoubleToFloat,
     EnvBase,
-    FrameSkipTransform,
     GymEnv,
+    GymWrapper,
     SerialEnv,
     Transform,
     TransformedEnv,
     UnsqueezeTransform,
 )
 
-from torchrl_l1.envs import (
-    DISTURBANCES,
-    TASKS,
-    BatchedMujocoEnv,
-    Disturbance,
-    Task,
-    disturbance_transforms,
-    disturbed_model,
-    get_task,
-    make_env,
-)
+from torchrl_l1.control import time_step
+from torchrl_l1.envs.factory import disturbance_transforms, make_env
+from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
+from torchrl_l1.envs.perturbations import DISTURBANCES, Disturbance
+from torchrl_l1.envs.plant import disturbed_model
+from torchrl_l1.envs.references import find_attribute, load_module, require
+from torchrl_l1.envs.task import Task
+from torchrl_l1.envs.tasks import TASKS
 
 MakeEnv: TypeAlias = str | Task | Callable[[], EnvBase]
 """A name, a task of ours, or a function that makes an environment."""
 
-_FORMS = (
+FORMS = (
     "gymnasium/ID (gymnasium/Pendulum-v1), a task of ours "
     f"({', '.join(TASKS)}), PACKAGE:ID, dm_control/DOMAIN/TASK, or MODULE:FUNCTION and "
     "FILE.py:FUNCTION, which return a TorchRL environment"
 )
+"""What names there are, in words."""
 
 
 @dataclass(frozen=True)
@@ -60,17 +54,24 @@ class EnvironmentSource:
         name: by which :func:`environment_source` finds it again; empty for a function.
         build: makes one environment, as its library has it.
         task: where it is a task of ours.
-        renders: whether ``build`` takes Gymnasium's ``render_mode``.
+        gymnasium_id: where it is one of Gymnasium's, the id without the package before it.
+        observation_keys: parts that make the observation, where not all do.
     """
 
     name: str
     build: Callable[..., EnvBase]
     task: Task | None = None
-    renders: bool = False
+    gymnasium_id: str = ""
+    observation_keys: tuple[str, ...] = ()
+
+    @property
+    def renders(self) -> bool:
+        """Whether :attr:`build` takes Gymnasium's ``render_mode``."""
+        return bool(self.gymnasium_id)
 
     def one(self) -> EnvBase:
         """One environment with a vector ``observation`` and a vector ``action``, both float32."""
-        return vector_environment(self.build())
+        return vector_environment(self.build(), self.observation_keys)
 
     def several(
         self,
@@ -127,7 +128,7 @@ class EnvironmentSource:
         return dict(disturbances)
 
     def _changed(self, disturbances: Mapping[str, float], **options: Any) -> EnvBase:
-        env = vector_environment(self.build(**options))
+        env = vector_environment(self.build(**options), self.observation_keys)
         plant = {name: v for name, v in disturbances.items() if _of_plant(DISTURBANCES[name])}
         if plant:
             simulation = simulation_of(env)
@@ -164,14 +165,16 @@ def _of_plant(disturbance: Disturbance) -> bool:
     return disturbance.acts_on == "plant"
 
 
-def environment_source(env: MakeEnv) -> EnvironmentSource:
+def environment_source(env: MakeEnv, search_path: Sequence[str | Path] = ()) -> EnvironmentSource:
     """What makes an environment, from its name or a function.
 
     Args:
         env: ``gymnasium/ID``, a task of ours, ``PACKAGE:ID`` of a package that registers with
             Gymnasium, ``dm_control/DOMAIN/TASK``, or ``MODULE:FUNCTION`` and ``FILE.py:FUNCTION``
-            of a function without arguments that returns a TorchRL environment; or such a function
-            itself.
+            of a function without arguments that returns an environment of TorchRL or Gymnasium, or
+            a :class:`Task`; or such a function itself.
+        search_path: folders for files, and for modules that Python's own path does not have; the
+            working directory comes after them.
 
     Raises:
         TypeError: for an environment in place of a function that makes it.
@@ -191,36 +194,63 @@ def environment_source(env: MakeEnv) -> EnvironmentSource:
     if isinstance(env, Task):
         return _of_task(env.name, env)
     if not isinstance(env, str):
-        return EnvironmentSource("", env)
+        return EnvironmentSource("", partial(_made, env))
     if env in TASKS:
-        return _of_task(env, get_task(env))
+        return _of_task(env, TASKS[env])
     first, _, rest = env.partition("/")
     if first == "gymnasium" and rest:
-        return _of_gymnasium(env, rest)
+        return _of_gymnasium(env, rest, search_path)
     if first == "dm_control":
         return _of_dm_control(env, rest)
-    module, _, name = env.partition(":")
-    if name.isidentifier() and (found := _attribute(module, name)) is not None:
-        return EnvironmentSource(env, found)
-    if name or env in gymnasium.registry:
-        return _of_gymnasium(env, env)
-    raise ValueError(f"unknown environment {env!r}; names are {_FORMS}")
+    module, _, name = env.rpartition(":")
+    if module and name.isidentifier() and (found := find_attribute(env, search_path)) is not None:
+        return _of_function(env, found)
+    if module.endswith(".py"):
+        raise ValueError(f"{module} has no {name!r}; names are {FORMS}")
+    if module or env in gymnasium.registry:
+        return _of_gymnasium(env, env, search_path)
+    raise ValueError(f"unknown environment {env!r}; names are {FORMS}")
 
 
 def _of_task(name: str, task: Task) -> EnvironmentSource:
     return EnvironmentSource(name, partial(BatchedMujocoEnv, task, 1), task)
 
 
-def _of_gymnasium(name: str, gymnasium_id: str) -> EnvironmentSource:
+def _of_function(name: str, found: Any) -> EnvironmentSource:
+    if isinstance(found, Task):
+        return _of_task(name, found)
+    if not callable(found):
+        raise ValueError(f"{name} is a {type(found).__name__}; it must be a function or a Task")
+    return EnvironmentSource(name, partial(_made, found, name))
+
+
+def _made(function: Callable[[], Any], name: str = "the function") -> EnvBase:
+    """What a function makes, as an environment of TorchRL."""
+    made = function()
+    if isinstance(made, gymnasium.Env):
+        return GymWrapper(made)
+    if isinstance(made, Task):
+        return BatchedMujocoEnv(made, 1)
+    if not isinstance(made, EnvBase):
+        raise ValueError(
+            f"{name} returns a {type(made).__name__}; it must return an environment of TorchRL or "
+            "Gymnasium, or a Task"
+        )
+    return made
+
+
+def _of_gymnasium(
+    name: str, gymnasium_id: str, search_path: Sequence[str | Path]
+) -> EnvironmentSource:
     package, colon, rest = gymnasium_id.partition(":")
     try:
         if colon:  # of a package that registers it
-            import_module(package)
+            load_module(package, search_path)
         plain = rest if colon else gymnasium_id
         gymnasium.spec(plain)
-    except (gymnasium.error.Error, ImportError) as error:
-        raise ValueError(f"{name}: {error}; names are {_FORMS}") from None
-    return EnvironmentSource(name, partial(GymEnv, plain), renders=True)
+    except (gymnasium.error.Error, ValueError) as error:
+        raise ValueError(f"{name}: {error}; names are {FORMS}") from None
+    return EnvironmentSource(name, partial(GymEnv, plain), gymnasium_id=plain)
 
 
 def _of_dm_control(name: str, rest: str) -> EnvironmentSource:
@@ -233,60 +263,16 @@ def _of_dm_control(name: str, rest: str) -> EnvironmentSource:
     return EnvironmentSource(name, partial(DMControlEnv, domain, task))
 
 
-def require(module: str, extra: str) -> ModuleType:
-    """Import a package that is not needed by all.
-
-    Raises:
-        ValueError: if it is not there, with the extra that brings it.
-    """
-    try:
-        return import_module(module)
-    except ImportError as error:
-        raise ValueError(
-            f"{module} cannot be imported ({error}): pip install 'torchrl-l1[{extra}]'"
-        ) from None
-
-
-def load_attribute(name: str) -> Any:
-    """What ``MODULE:NAME`` or ``FILE.py:NAME`` names.
-
-    Raises:
-        ValueError: if there is none.
-    """
-    module, _, attribute = name.partition(":")
-    found = _attribute(module, attribute)
-    if found is None:
-        raise ValueError(f"{module} has no {attribute!r}")
-    return found
-
-
-def _attribute(module: str, name: str) -> Any:
-    return getattr(_module(module), name, None)
-
-
-def _module(name: str) -> ModuleType:
-    if not name.endswith(".py"):
-        try:
-            return import_module(name)
-        except (ImportError, TypeError, ValueError) as error:
-            raise ValueError(f"there is no module {name!r} ({error})") from None
-    file = Path(name).resolve()
-    if not file.exists():
-        raise ValueError(f"there is no file {name}")
-    spec = importlib.util.spec_from_file_location(file.stem, file)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # As of an import: what the file defines may look its own module up.
-    sys.modules.setdefault(file.stem, module)
-    spec.loader.exec_module(module)
-    return module
-
-
-def vector_environment(env: EnvBase) -> EnvBase:
+def vector_environment(env: EnvBase, keys: Sequence[str] = ()) -> EnvBase:
     """An environment with a vector ``observation`` and a vector ``action``, both float32.
 
     Where the observation comes in parts, as dm_control's does, they are joined in the order of
     their names.
+
+    Args:
+        env: the environment.
+        keys: the parts that make the observation, in this order; if none are given, ``observation``
+            or, where that is no part, all.
 
     Raises:
         ValueError: if it has no such observation or action.
@@ -300,19 +286,23 @@ def vector_environment(env: EnvBase) -> EnvBase:
             f"{env.full_action_spec}"
         )
     transforms: list[Transform] = []
-    found = _vectors(env)
-    if "observation" in found:
+    found = vectors(env)
+    check_keys(keys, found, type(env).__name__)
+    if keys:
+        found = {key: found[key] for key in keys}
+    elif "observation" in found:
         found = {"observation": found["observation"]}
-    elif found:
+    if list(found) != ["observation"]:
+        if not found:
+            raise ValueError(
+                f"{type(env).__name__} has no vector of floating-point observations, only "
+                f"{sorted(map(str, env.full_observation_spec.keys(True, True)))}"
+            )
         scalars = [key for key, spec in found.items() if spec.ndim == len(env.batch_size)]
         if scalars:
             transforms.append(UnsqueezeTransform(-1, in_keys=scalars, out_keys=scalars))
-        transforms.append(CatTensors(sorted(found), "observation", del_keys=False))
-    else:
-        raise ValueError(
-            f"{type(env).__name__} has no vector of floating-point observations, only "
-            f"{sorted(map(str, env.full_observation_spec.keys(True, True)))}"
-        )
+        parts = list(keys) or sorted(found)
+        transforms.append(CatTensors(parts, "observation", del_keys=False, sort=False))
     double = {
         "in_keys": ["observation"] * any(s.dtype == torch.float64 for s in found.values()),
         "in_keys_inv": ["action"] * (action.dtype == torch.float64),
@@ -322,7 +312,23 @@ def vector_environment(env: EnvBase) -> EnvBase:
     return TransformedEnv(env, Compose(*transforms), auto_unwrap=True) if transforms else env
 
 
-def _vectors(env: EnvBase) -> dict[str, TensorSpec]:
+def check_keys(keys: Sequence[str], there: Sequence[str] | Mapping[str, Any], name: str) -> None:
+    """Refuse parts of an observation that an environment does not have, or that come twice.
+
+    Raises:
+        ValueError: naming them and those that there are.
+    """
+    for key in keys:
+        if key not in there:
+            raise ValueError(
+                f"observation_keys: {name} has no vector {key!r} in its observations; there are "
+                f"{', '.join(sorted(there)) or 'none'}"
+            )
+    if len(set(keys)) < len(keys):
+        raise ValueError(f"observation_keys names a part twice: {', '.join(keys)}")
+
+
+def vectors(env: EnvBase) -> dict[str, TensorSpec]:
     """Floating-point observations that are vectors, or numbers, and not nested."""
     dims = len(env.batch_size)
     return {
@@ -330,36 +336,6 @@ def _vectors(env: EnvBase) -> dict[str, TensorSpec]:
         for key, spec in env.full_observation_spec.items(True, True)
         if isinstance(key, str) and spec.dtype.is_floating_point and spec.ndim - dims <= 1
     }
-
-
-def time_step(env: EnvBase) -> float | None:
-    """Time of one environment step in seconds; ``None`` where the environment does not tell.
-
-    Asked are Gymnasium's ``dt``, dm_control's ``control_timestep`` and the tasks here; frames that
-    are skipped count.
-
-    Examples:
-        >>> from torchrl.envs import GymEnv
-        >>> time_step(GymEnv("Pendulum-v1", frame_skip=2))
-        0.1
-    """
-    frames = 1
-    while isinstance(env, TransformedEnv):
-        for transform in env.transform.modules():
-            if isinstance(transform, FrameSkipTransform):
-                frames *= transform.frame_skip
-        env = env.base_env
-    if isinstance(env, BatchedMujocoEnv):
-        return frames * env.task.dt
-    inner = getattr(env, "_env", None)
-    if inner is None:
-        return None
-    frames *= getattr(env, "wrapper_frame_skip", 1)
-    control = getattr(inner, "control_timestep", None)
-    if callable(control):
-        return frames * float(control())
-    dt = getattr(getattr(inner, "unwrapped", None), "dt", None)
-    return frames * float(dt) if isinstance(dt, (int, float)) and dt > 0 else None
 
 
 def simulation_of(env: EnvBase) -> Any:

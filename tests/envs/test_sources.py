@@ -8,8 +8,8 @@ from tensordict import TensorDict
 from torchrl.envs import FrameSkipTransform, GymEnv, GymWrapper, TransformedEnv
 
 from torchrl_l1.deployment import environment_source, time_step, vector_environment
-from torchrl_l1.deployment.environments import simulation_of
 from torchrl_l1.envs import TASKS, make_env
+from torchrl_l1.envs.sources import simulation_of
 
 
 class InParts(gymnasium.Env):
@@ -54,8 +54,13 @@ def test_names(name, width):
     assert env.observation_spec["observation"].shape[-1] == width
 
 
-def test_functions_of_files(policy_file):
-    source = environment_source(f"{policy_file}:make_env")
+def test_functions_of_files(tmp_path):
+    file = tmp_path / "own.py"
+    file.write_text(
+        "from torchrl.envs import GymEnv\n\n\ndef make_env():\n"
+        "    return GymEnv('InvertedPendulum-v5')\n"
+    )
+    source = environment_source(f"{file}:make_env")
     assert source.one().observation_spec["observation"].shape == (4,)
     assert source.time_step() == pytest.approx(0.04)
 

@@ -1,0 +1,199 @@
+"""Environments of the user's through run, sweeps, campaigns, evaluations and reports."""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from torchrl_l1.campaign import read_campaign
+from torchrl_l1.campaign.jobs import sweep
+from torchrl_l1.campaign.plan import plan
+from torchrl_l1.cli import main
+from torchrl_l1.experiment.launch import compose
+
+PACKAGE = """
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+
+
+class Raft(gymnasium.Env):
+    dt = 0.1
+    observation_space = Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = Box(np.float32(-1), np.float32(2), (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = self.np_random.uniform(-1.0, 1.0, 2)
+        return self.state.copy(), {}
+
+    def step(self, action):
+        self.state = self.state + 0.1 * np.array([self.state[1], action[0]])
+        return self.state.copy(), -float(np.square(self.state).sum()), False, False, {}
+
+
+def make_env():
+    return Raft()
+
+
+def reward(observation, action, next_observation):
+    return -next_observation.square().sum(-1)
+
+
+if "Raft-v0" not in gymnasium.registry:
+    gymnasium.register("Raft-v0", Raft, max_episode_steps=9)
+"""
+
+TINY = [
+    *("outer_iterations=1", "horizon=8", "random_episodes=2", "particles=2", "cem.horizon=2"),
+    *("cem.candidates=4", "cem.elites=2", "cem.iterations=1", "model.members=2"),
+    *("model.hidden=[8]", "fit.max_epochs=1", "fit.max_gradient_steps=3", "wandb.mode=disabled"),
+    *("termination=none", "fit.validation_fraction=0.3"),
+]
+NAMES = ["rafts:Raft-v0", "rafts.boats:make_env", "own.py:make_env"]
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a package, a file and a recipe of the user's, in which commands are given."""
+    package = tmp_path / "rafts"
+    package.mkdir()
+    (package / "boats.py").write_text(PACKAGE)
+    (package / "__init__.py").write_text("from rafts.boats import Raft, make_env, reward\n")
+    (tmp_path / "own.py").write_text(PACKAGE)
+    (tmp_path / "mine.yaml").write_text(
+        "defaults:\n  - /pets/any@_global_\n  - _self_\nrecipe: mine\n"
+        "task: own.py:make_env\nreward: own.py:reward\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield tmp_path
+    for name in [name for name in sys.modules if name.partition(".")[0] in ("rafts", "own")]:
+        del sys.modules[name]
+
+
+def rows(file: Path) -> list[dict[str, str]]:
+    with file.open() as handle:
+        return list(csv.DictReader(handle))
+
+
+def apart(arguments: Sequence[str], folder: Path) -> str:
+    """The command as a process of its own, as users give it: the folder is not on Python's path."""
+    script = "import sys; sys.path.remove(''); from torchrl_l1.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", script, *arguments], cwd=folder, text=True,
+        capture_output=True, env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_a_file_beside_the_recipe_is_found_from_everywhere(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Run, resume, evaluate and report, each from another folder."""
+    elsewhere = place / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    run_dir = place / "runs" / "a"
+    main(["run", "../mine.yaml", *TINY, f"run_dir={run_dir}"])
+    config = OmegaConf.load(run_dir / "config.yaml")
+    assert (config.task, list(config.search_path)) == ("own.py:make_env", [str(place)])
+    monkeypatch.chdir(place / "runs")
+    main(["run", "../mine.yaml", *TINY, f"run_dir={run_dir}", "outer_iterations=2", "--resume"])
+    assert len(rows(run_dir / "metrics.csv")) == 2
+    main(
+        ["evaluate", str(run_dir), "--episodes", "2", "--bias", "0", "0.5", "--l1", "off", "robust"]
+    )
+    table = rows(run_dir / "evaluation" / "evaluation.csv")
+    assert {row["l1"] for row in table} == {"off", "robust"} and len(table) == 4
+    main(["report", str(place / "runs")])
+    assert "own.py:make_env" in (place / "runs" / "report" / "report.md").read_text()
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+def test_sweeps_over_packages_functions_and_files(launcher: str, place: Path) -> None:
+    """In a process of its own, whose path does not have the folder, and in the launcher's."""
+    if launcher == "joblib":
+        pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    tasks = ",".join(NAMES)
+    more = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"] if launcher == "joblib" else []
+    apart(["run", "pets/any", "-m", f"task={tasks}", "reward=rafts:reward", *TINY, *more], place)
+    found = sorted(place.glob("runs/**/metrics.csv"))
+    assert len(found) == 3
+    names = {OmegaConf.load(file.with_name("config.yaml")).task for file in found}
+    assert names == set(NAMES)
+    # The same environment under three names learns the same.
+    assert len({file.read_text() for file in found}) == 1
+
+
+def test_a_campaign_over_environments(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (place / "study.yaml").write_text(
+        "runs:\n  - recipe: pets/any\n    overrides: ["
+        + ", ".join(f"'{text}'" for text in [*TINY, "reward=rafts:reward"])
+        + "]\n    matrix:\n      task: [rafts:Raft-v0, own.py:make_env]\n"
+        "evaluations:\n  - name: frozen\n    l1: [off]\n    bias: [0.0, 0.5]\n    episodes: 2\n"
+    )
+    main(["campaign", "study.yaml", "--workers", "1", "--output", "out"])
+    folders = sorted(path.name for path in (place / "out" / "pets" / "any").iterdir())
+    assert folders == ["task=own.py_make_env", "task=rafts_Raft-v0"]
+    for folder in folders:
+        run_dir = place / "out" / "pets" / "any" / folder / "seed_0"
+        assert len(rows(run_dir / "evaluations" / "frozen.csv")) == 2
+    planned = plan(read_campaign("study.yaml"), Path("out"))
+    assert all(run.finished() for run in planned)
+    arguments = sweep(read_campaign("study.yaml").runs[0], Path("/out"), "basic")
+    assert any("${path_text:${hydra:overrides.task.0}}" in text for text in arguments)
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["task=gymnasium/CartPole-v1"], "Discrete(2) as actions"),
+        (["task=gymnasium/MountainCarContinuous-v0"], "give dt=SECONDS"),
+        (["task=gymnasium/Nothing-v0"], "Nothing"),
+        (["task=nowhere.py:make"], "no file nowhere.py"),
+        (["task=own.py:nothing"], "own.py has no 'nothing'"),
+        (["task=own.py:PACKAGES", "horizon=3"], "own.py has no"),
+        (["task=own.py:make_env"], "give horizon=STEPS"),
+        (["task=own.py:make_env", "horizon=3"], "say reward=learned or"),
+        (["task=own.py:make_env", "horizon=3", "reward=learned"], "say termination=learned"),
+        (["task=own.py:make_env", "horizon=3", "dt=0.2"], "takes 0.1 s, not 0.2"),
+        (["task=half_cheetah", "dt=0.2"], "leave dt out"),
+        (["task=half_cheeta"], "Unknown task 'half_cheeta'"),
+    ],
+)
+def test_what_will_not_do_is_a_line_before_work_starts(
+    overrides: list[str], words: str, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["run", "pets/any", *overrides, "run_dir=there", "wandb.mode=disabled"])
+    error = capsys.readouterr().err.strip()
+    assert words in error
+    assert error.startswith("torchrl-l1 run: ") and "\n" not in error
+    assert not (place / "there").exists()
+
+
+def test_plants_that_cannot_be_changed_are_refused_before_a_campaign_starts(place: Path) -> None:
+    (place / "study.yaml").write_text(
+        "runs:\n  - recipe: mine.yaml\n    overrides: [termination=none, horizon=8]\n"
+        "evaluations:\n  - name: frozen\n    mass: [2.0]\n"
+    )
+    with pytest.raises(ValueError, match="mass changes the plant"):
+        plan(read_campaign("study.yaml"), Path("out"))
+
+
+def test_only_recipes_that_name_code_have_a_search_path(place: Path) -> None:
+    assert list(compose("mine.yaml").search_path) == [str(place)]
+    assert list(compose("pets/any", ["task=gymnasium/Pendulum-v1"]).search_path) == []
+    assert list(compose("pets/any", ["task=rafts:Raft-v0"]).search_path) == [str(place)]
+    assert list(compose("metrpo/half_cheetah").search_path) == []

@@ -1,0 +1,289 @@
+"""W&B and TensorBoard beside the tables: complete, in one run, whatever happens between."""
+
+from __future__ import annotations
+
+import csv
+import random
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import wandb
+from omegaconf import DictConfig
+from PIL import Image
+from wandb.proto import wandb_internal_pb2
+
+from tests.wandb_files import problems, wandb_files
+from tests.wandb_server import wandb_server
+from torchrl_l1.campaign.description import read_campaign
+from torchrl_l1.campaign.plan import plan
+from torchrl_l1.cli import main
+from torchrl_l1.experiment.evaluate import load_run
+from torchrl_l1.experiment.run import run
+from torchrl_l1.experiment.tracking import Evaluated, log_evaluation
+from torchrl_l1.experiment.wandb_files import ID_FILE, known_id, whole_records
+
+Recipe = Callable[..., DictConfig]
+OFFLINE = "wandb.mode=offline"
+
+
+@pytest.fixture(autouse=True)
+def _nobody_is_logged_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in ("WANDB_MODE", "WANDB_API_KEY", "WANDB_RESUME", "WANDB_RUN_ID"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
+    monkeypatch.setenv("WANDB_CONFIG_DIR", str(tmp_path / "wandb_config"))
+
+
+def settled(run_dir: Path) -> list[str]:
+    """What W&B's files lack once its own process has written the last of them."""
+    deadline = time.monotonic() + 60
+    while (found := problems(run_dir)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return found
+
+
+def newest(run_dir: Path) -> Path:
+    return wandb_files(run_dir)[-1].path
+
+
+def cut(file: Path, rows: int) -> None:
+    """Leave so many whole rows of a file and half of the next, as a kill may."""
+    content = file.read_bytes()
+    ends = [
+        end
+        for raw, end in whole_records(content)
+        if wandb_internal_pb2.Record.FromString(raw).WhichOneof("record_type") == "history"
+    ]
+    file.write_bytes(content[: ends[rows] - 5])
+
+
+def test_offline_files_hold_every_step_with_its_values(tiny_recipe: Recipe) -> None:
+    settings = [
+        *("wandb.entity=lab", "wandb.project=mine", "wandb.group=night", "wandb.name=first"),
+        *("wandb.tags=[a,b]", "wandb.notes=why"),
+    ]
+    run_dir = run(tiny_recipe(OFFLINE, *settings))
+    assert not settled(run_dir)
+    (file,) = wandb_files(run_dir)
+    written = file.runs[0]
+    assert (written.entity, written.project, written.run_group) == ("lab", "mine", "night")
+    assert (written.display_name, written.notes, list(written.tags)) == ("first", "why", ["a", "b"])
+    config = {item.key for item in written.config.update}
+    assert {"task", "model", "versions", "choices"} <= config
+
+
+@pytest.mark.parametrize("rows", [0, 2])
+def test_what_a_kill_has_cut_off_is_logged_again(rows: int, tiny_recipe: Recipe) -> None:
+    run_dir = run(tiny_recipe(OFFLINE, "outer_iterations=3"))
+    assert not settled(run_dir)
+    cut(newest(run_dir), rows)
+    assert len(wandb_files(run_dir)[0].history) == rows
+    # All iterations are complete: only W&B lacks some.
+    run(tiny_recipe(OFFLINE, "outer_iterations=3", "resume=true"))
+    assert not settled(run_dir)
+    first, second = wandb_files(run_dir)
+    assert [len(first.history), len(second.history)] == [rows, 3 - rows]
+    # Where nothing is lacking, nothing is written.
+    run(tiny_recipe(OFFLINE, "outer_iterations=3", "resume=true"))
+    assert len(wandb_files(run_dir)) == 2
+
+
+def test_an_iteration_that_is_trained_again_is_not_logged_again(tiny_recipe: Recipe) -> None:
+    run_dir = run(tiny_recipe(OFFLINE))
+    assert not settled(run_dir)
+    (run_dir / "checkpoint.pt").write_bytes(b"")
+    run(tiny_recipe(OFFLINE, "outer_iterations=3", "resume=true"))
+    files = wandb_files(run_dir)
+    assert [[row["iteration"] for row in file.history] for file in files] == [[0, 1], [2]]
+
+
+def test_evaluations_go_to_the_run_and_the_training_goes_on(
+    tiny_recipe: Recipe, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_dir = run(tiny_recipe(OFFLINE))
+    drawn = known_id(run_dir)
+    main(["evaluate", str(run_dir), "--episodes", "2", "--bias", "0", "1", "--l1", "off"])
+    assert "is not logged" not in capsys.readouterr().err
+    run(tiny_recipe(OFFLINE, "outer_iterations=3", "resume=true"))
+    assert not settled(run_dir)
+    training, evaluation, more = wandb_files(run_dir)
+    assert {file.runs[0].run_id for file in (training, evaluation, more)} == {drawn}
+    (row,) = evaluation.history
+    assert row["evaluation/_type"] == "table-file"
+    assert row["evaluation/robustness/_type"] == "image-file"
+    assert [row["_step"] for row in more.history] == [3]
+    folder = evaluation.path.parent / "files"
+    for name in ("evaluation", "evaluation/robustness"):
+        assert (folder / row[f"{name}/path"]).is_file()
+
+
+def test_nothing_of_wandb_where_it_is_not_wanted(tiny_recipe: Recipe, tmp_path: Path) -> None:
+    run_dir = run(tiny_recipe("loggers=[]", "wandb.mode=offline"))
+    main(["evaluate", str(run_dir), "--episodes", "2", "--bias", "0", "--l1", "off"])
+    assert not (run_dir / "wandb").exists() and not (run_dir / ID_FILE).exists()
+
+
+def test_online_without_a_key_is_a_line_and_leaves_nothing(
+    tmp_path: Path, tiny_overrides: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["run", "metrpo/inverted_pendulum", *tiny_overrides, "wandb.mode=online"]
+    before = set(tmp_path.iterdir())
+    with pytest.raises(SystemExit) as exit_info:
+        main([*command, f"run_dir={tmp_path / 'run'}"])
+    assert exit_info.value.code == 1
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "wandb.mode=online needs an API key" in line and "wandb login" in line
+    assert set(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("loggers=[wandb,paper]", "loggers must be"),
+        ("checkpoint.every=0", r"checkpoint\.every"),
+    ],
+)
+def test_settings_that_cannot_be_meant_are_named(
+    override: str, words: str, tiny_recipe: Recipe, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=words):
+        run(tiny_recipe(override))
+    assert not (tmp_path / "run").exists()
+
+
+def test_names_tell_arms_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tiny_overrides: list[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    named = []
+    monkeypatch.setattr(
+        "torchrl_l1.experiment.launch.run", lambda config: named.append(config.wandb.name)
+    )
+    monkeypatch.setattr("torchrl_l1.experiment.launch.final_return", lambda run_dir: 0.0)
+    recipe = "metrpo/inverted_pendulum"
+    main(["run", recipe, "-m", "l1=off,paper", "seed=0,1", "wandb.tags=[x]", "loggers=[wandb]"])
+    assert named == [f"{recipe} l1={l1} seed={seed}" for l1 in ("off", "paper") for seed in (0, 1)]
+    main(["run", recipe, "wandb.name=mine"])
+    assert named[-1] == "mine"
+    (tmp_path / "study.yaml").write_text(
+        f"runs: [{{recipe: {recipe}, matrix: {{l1: ['off', paper], seed: [0]}}}}]\n"
+    )
+    runs = plan(read_campaign("study.yaml"), tmp_path)
+    assert [one.config.wandb.name for one in runs] == [
+        f"{recipe} l1=off seed=0",
+        f"{recipe} l1=paper seed=0",
+    ]
+
+
+def test_tensorboard_lacks_nothing_after_a_kill(tiny_recipe: Recipe) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    both = "loggers=[tensorboard]"
+    run_dir = run(tiny_recipe(both))
+    (events,) = (run_dir / "tensorboard").glob("events*")
+    events.write_bytes(events.read_bytes()[:-100])
+    run(tiny_recipe(both, "resume=true"))
+    run(tiny_recipe(both, "resume=true", "outer_iterations=3"))
+    main(["evaluate", str(run_dir), "--episodes", "2", "--bias", "0", "1", "--l1", "off"])
+    shown = EventAccumulator(str(run_dir / "tensorboard"), {"scalars": 0}).Reload()
+    with (run_dir / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for name in rows[0]:
+        values = {event.step: event.value for event in shown.Scalars(name)}
+        assert values == pytest.approx({i: float(row[name]) for i, row in enumerate(rows)})
+    assert "evaluation/robustness" in shown.Tags()["images"]
+
+
+def test_tensorboard_that_is_not_installed_is_a_line(
+    tiny_recipe: Recipe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchrl_l1.experiment.tracking.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"pip install 'torchrl-l1\[tensorboard\]'"):
+        run(tiny_recipe("loggers=[tensorboard]"))
+
+
+def test_wandb_sync_makes_one_run_of_what_kills_and_evaluations_have_left(
+    tiny_recipe: Recipe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_dir = run(tiny_recipe(OFFLINE))
+    assert not settled(run_dir)
+    cut(newest(run_dir), 1)
+    recipe = load_run(run_dir).recipe
+    chart = run_dir.with_name("chart.png")
+    Image.new("RGB", (8, 8)).save(chart)
+    log_evaluation(recipe, run_dir, Evaluated("evaluation", [], [chart]))
+    run(tiny_recipe(OFFLINE, "outer_iterations=3", "resume=true"))
+    assert not settled(run_dir)
+    with wandb_server() as server:
+        monkeypatch.setenv("WANDB_BASE_URL", server.url)
+        monkeypatch.setenv("WANDB_API_KEY", 40 * "a")
+        monkeypatch.delenv("WANDB_SERVICE", raising=False)  # the process of these tests
+        files = map(str, run_dir.glob("wandb/offline-run-*"))
+        command = [sys.executable, "-m", "wandb", "sync", *files]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+    ((drawn, lines),) = server.history.items()
+    assert drawn == known_id(run_dir)
+    shown = [lines[number] for number in sorted(lines)]
+    assert [row["_step"] for row in shown] == [0, 1, 2, 3]
+    assert ["evaluation/chart" in row for row in shown] == [False, False, True, False]
+    with (run_dir / "metrics.csv").open() as file:
+        for row, logged in zip(csv.DictReader(file), shown[:2] + shown[3:], strict=True):
+            assert {name: float(value) for name, value in row.items()} == {
+                name: float(logged[name]) for name in row
+            }
+    assert any(name.startswith("media/images/evaluation/chart") for name in server.media)
+
+
+def test_a_run_that_is_logged_online_is_completed_when_it_goes_on(
+    tiny_recipe: Recipe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with wandb_server() as server:
+        monkeypatch.setenv("WANDB_BASE_URL", server.url)
+        monkeypatch.setenv("WANDB_API_KEY", 40 * "a")
+        wandb.teardown()  # it reads its settings once
+        run_dir = run(tiny_recipe("wandb.mode=online", "wandb.name=arm"))
+        drawn = str(known_id(run_dir))
+        assert server.settings[drawn]["displayName"] == "arm"
+        # The last row has not arrived, and the file has lost it too.
+        del server.history[drawn][1]
+        server.summaries[drawn] = {**server.history[drawn][0]}
+        cut(newest(run_dir), 1)
+        run(tiny_recipe("wandb.mode=online", "wandb.name=arm", "resume=true"))
+        run(tiny_recipe("wandb.mode=online", "outer_iterations=3", "resume=true"))
+        wandb.teardown()
+    assert list(server.history) == [drawn]
+    steps = [(row["_step"], row["iteration"]) for row in server.history[drawn].values()]
+    assert steps == [(0, 0), (1, 1), (2, 2)]
+
+
+def test_kills_at_random_moments_lose_nothing(
+    tmp_path: Path, tiny_overrides: list[str], start_cli: Callable[..., Any]
+) -> None:
+    """Of processes that are forked; ``python -m tests.kills`` does it with whole ones."""
+    settings = [*tiny_overrides, OFFLINE, "outer_iterations=4", "fit.max_epochs=100"]
+    folder = tmp_path / "run"
+    command = ["run", "metrpo/inverted_pendulum", *settings, f"run_dir={folder}", "--resume"]
+    rng = random.Random(0)
+    for rows in (0, 1, 3):
+        process = start_cli(command)
+        while process.poll() is None and not logged(folder, rows):
+            time.sleep(0.005)
+        time.sleep(rng.uniform(0, 0.3))
+        process.kill()
+        process.wait()
+    assert start_cli(command).wait(timeout=300) == 0
+    assert not settled(folder)
+    assert len(wandb_files(folder)) > 1
+
+
+def logged(folder: Path, rows: int) -> bool:
+    file = folder / "metrics.csv"
+    begun = any(folder.glob("wandb/offline-run-*/*.wandb"))
+    return begun and (not rows or (file.exists() and len(file.read_text().splitlines()) > rows))

@@ -1,0 +1,111 @@
+"""The numbers of the studies' pages are those of the files that their commands write."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "docs/results"
+TASKS = ("inverted_pendulum", "swimmer", "hopper", "walker", "half_cheetah")
+
+
+def script(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """A script of the results' folder, as it is when it is run from there."""
+    monkeypatch.syspath_prepend(str(RESULTS))
+    spec = importlib.util.spec_from_file_location(name, RESULTS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, name, module)
+    spec.loader.exec_module(module)
+    return module
+
+
+def rows(text: str) -> list[dict[str, str]]:
+    """Rows of the first Markdown table in a text."""
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    return [dict(zip(cells[0], line, strict=True)) for line in cells[2:]]
+
+
+def overall() -> dict[str, dict[str, str]]:
+    """What is recovered, by task, as the script wrote it."""
+    return {row["task"]: row for row in rows((RESULTS / "robust/overall.md").read_text())}
+
+
+def section(page: str, heading: str) -> str:
+    text = (ROOT / page).read_text().partition(heading)[2]
+    assert text, f"{page} has no {heading!r}"
+    return text
+
+
+def test_readme_shows_what_is_recovered() -> None:
+    text = (ROOT / "README.md").read_text()
+    shown = rows(text[text.index("| share of the oracle's gain |") :].partition("\n\n")[0])
+    for line, l1 in zip(shown, ("paper", "robust"), strict=True):
+        numbers = list(line.values())[1:]
+        expected = [overall()[task][f"{l1} recovered"].split()[0] for task in TASKS]
+        assert numbers == expected
+
+
+def test_recovered_table_is_that_of_the_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    robust = script("robust", monkeypatch)
+    found = robust.overall(robust.read(RESULTS / "robust/inverted_pendulum.csv"))
+    assert {name: overall()["inverted_pendulum"][name] for name in found} == found
+
+
+def test_first_sentences_of_the_study_quote_the_table() -> None:
+    first = section("docs/studies/robustness.md", "# What L1 recovers").partition("\n## ")[0]
+    shares = {task: float(row["robust recovered"].split()[0]) for task, row in overall().items()}
+    quoted = re.search(r"between ([\d.]+) \((\w+)\)\s+and ([\d.]+) \((\w+)\)", first)
+    assert quoted is not None
+    low, high = min(shares, key=shares.get), max(shares, key=shares.get)
+    assert [quoted[1], quoted[2].lower()] == [f"{shares[low]:.2f}", low]
+    assert [quoted[3], quoted[4].lower()] == [f"{shares[high]:.2f}", high]
+    harm = rows((RESULTS / "robust/harm.md").read_text())
+    worst = min(float(row["L1 robust, %"].split()[0]) for row in harm)
+    assert f"at worst {-worst:.1f} % lower" in " ".join(first.split())
+
+
+def test_table_of_the_paper_is_that_of_the_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    questions = script("questions", monkeypatch)
+    monkeypatch.setattr(questions, "HERE", tmp_path)
+    questions.table1()
+    written = (tmp_path / "table1.md").read_text()
+    assert written == (RESULTS / "questions/table1.md").read_text()
+    cells = {(row["task"], row["noise"]): row for row in rows(written)}
+    assert len(cells) == 15
+    with (RESULTS / "table1_first/pairs.csv").open(newline="") as handle:
+        for pair in csv.DictReader(handle):
+            if pair["policy"] == "stochastic":
+                cell = cells.pop((pair["task"], pair["noise"]))
+                found, given = float(cell["difference"]), float(pair["difference_mean"])
+                assert found == pytest.approx(given, rel=6e-3)
+    assert cells and all(row["L1 paper"] == "not run" for row in cells.values())
+
+
+def test_index_quotes_the_tables() -> None:
+    table = {
+        (row["task"], row["noise"]): row
+        for row in rows((RESULTS / "questions/table1.md").read_text())
+    }
+    text = " ".join(section("docs/studies/index.md", "## Does the paper's table hold?").split())
+    for task, noise in [(t, n) for (t, n), row in table.items() if row["seeds"] != "0"]:
+        for l1 in ("L1 off", "L1 paper"):
+            value = float(table[task, noise][l1])
+            quoted = f"{value:.3f}" if abs(value) < 1 else f"{value:.3g}"
+            if abs(value) >= 1000:
+                quoted = f"{value:.0f}"
+            assert quoted in text, (task, noise, l1, quoted)
+    shares = overall()
+    second = text.partition("## What does L1 recover")[2].partition("## ")[0]
+    for task in TASKS:
+        for l1 in ("paper", "robust"):
+            assert shares[task][f"{l1} recovered"].split()[0] in second, (task, l1)

@@ -1,0 +1,311 @@
+"""Where rewards and ends of imagined trajectories come from: the task, functions, or models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import ReplayBuffer
+
+from torchrl_l1.algorithms.collection import seed_streams
+from torchrl_l1.checks import check_choice, check_counts, check_widths
+from torchrl_l1.dynamics import (
+    FitConfig,
+    RewardModel,
+    TerminationModel,
+    fit_reward,
+    fit_termination,
+)
+from torchrl_l1.dynamics.ensemble import ACTIVATIONS
+from torchrl_l1.dynamics.transitions import split_validation
+from torchrl_l1.envs import AnyTask, ExternalTask, StartStates, Task, action_bounds, load_attribute
+
+REWARDS = ("builtin", "learned")
+"""The words of ``reward``; anything else is a function."""
+
+TERMINATIONS = ("builtin", "learned", "none")
+"""The words of ``termination``; anything else is a function."""
+
+OUTCOME_METRICS: dict[str, str] = {
+    "reward_model/validation_loss": "With `reward=learned`: mean over members of the lowest "
+    "validation loss of the reward, normalised units.",
+    "reward_model/explained_variance": "With `reward=learned`: share of the variance of the "
+    "validation data's rewards that the model explains.",
+    "termination_model/validation_loss": "With `termination=learned`: mean over members of the "
+    "lowest validation loss, nats, terminal states weighted; 0 before one is seen.",
+    "termination_model/terminal": "With `termination=learned`: share of the training transitions "
+    "that ended an episode.",
+    "termination_model/missed": "With `termination=learned`: share of the terminal states kept out "
+    "of training that the model does not call terminal; 0 if there are none.",
+    "termination_model/false_alarms": "With `termination=learned`: share of the other states kept "
+    "out of training that it calls terminal.",
+}
+"""What the fits of learned rewards and terminations report."""
+
+Termination = Callable[[Tensor], Tensor]
+
+
+@dataclass
+class OutcomeConfig:
+    """The ensembles of a learned reward and a learned termination, each of its own.
+
+    They are fitted as the dynamics are, without decay, resampling and elites.
+
+    Attributes:
+        members: number of networks; their mean counts.
+        hidden: widths of their hidden layers.
+        activation: ``relu``, ``tanh`` or ``silu``.
+    """
+
+    members: int = 3
+    hidden: list[int] = field(default_factory=lambda: [128, 128])
+    activation: str = "silu"
+
+    def __post_init__(self) -> None:
+        check_counts(self, "members", prefix="outcome_model.")
+        check_widths("outcome_model.hidden", self.hidden)
+        check_choice("outcome_model.activation", self.activation, tuple(ACTIVATIONS))
+
+
+def check_outcome(name: str, value: str) -> None:
+    """Refuse what is neither a word nor the form of a function, with a ``ValueError``.
+
+    Args:
+        name: ``reward`` or ``termination``.
+        value: what it is set to.
+
+    Examples:
+        >>> check_outcome("reward", "me")
+        Traceback (most recent call last):
+            ...
+        ValueError: reward must be builtin, learned, MODULE:FUNCTION or FILE.py:FUNCTION, got 'me'
+    """
+    words = REWARDS if name == "reward" else TERMINATIONS
+    module, colon, function = value.partition(":")
+    if value not in words and not (module and colon and function.isidentifier()):
+        raise ValueError(
+            f"{name} must be {', '.join(words)}, MODULE:FUNCTION or FILE.py:FUNCTION, got {value!r}"
+        )
+
+
+class Outcomes:
+    """What imagined transitions earn, and which of them end an episode.
+
+    Models of either are fitted after the dynamics, to the same data. Their random numbers are
+    streams of their own: what else is drawn in a run does not depend on them.
+
+    Args:
+        task: whose reward and termination are the built-in ones.
+        reward: ``builtin``, ``learned``, or a function ``MODULE:FUNCTION`` of observation, action
+            and next observation, batched torch.
+        termination: ``builtin``, ``learned``, ``none``, or a function of the next observation.
+        config: of the models.
+        fit: how the dynamics are fitted.
+        std_floor: smallest standard deviation of the normalisers, raw units.
+        margin: how far a learned reward may lie beyond those of the data, fraction of their range.
+        seed: of the run.
+        device: of the models.
+        search_path: folders for files and modules that are named.
+
+    Attributes:
+        own_termination: whether imagined trajectories end as the task does.
+        reward: maps observations ``(..., n)``, actions ``(..., m)`` and next observations to
+            ``(...)``.
+        models: those that are learned, by their names.
+
+    Raises:
+        ValueError: if there is no such function, or if it does not do what it should.
+    """
+
+    def __init__(
+        self,
+        task: AnyTask,
+        reward: str = "builtin",
+        termination: str = "builtin",
+        config: OutcomeConfig | None = None,
+        fit: FitConfig | None = None,
+        *,
+        std_floor: float = 1e-4,
+        margin: float = 0.5,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        search_path: Sequence[str] = (),
+    ) -> None:
+        check_outcome("reward", reward)
+        check_outcome("termination", termination)
+        # What is theirs alone: decay goes by the layers of the dynamics, elites by its members.
+        alone: dict[str, Any] = {
+            "weight_decay": [],
+            "weight_penalty": 0.0,
+            "bootstrap": False,
+            "elites": None,
+        }
+        self.fit_config = replace(fit or FitConfig(), **alone)
+        self.seed, self.device = seed, torch.device(device)
+        self.models: dict[str, RewardModel | TerminationModel] = {}
+        n, m = task.observation_dim, task.action_dim
+        networks = vars(config or OutcomeConfig())
+        self.reward: Callable[[Tensor, Tensor, Tensor], Tensor]
+        self._termination: Termination | None = None
+        self.own_termination = termination == "builtin"
+        with self._stream("initialisation"):
+            if reward == "learned":
+                model = RewardModel(n, m, **networks, std_floor=std_floor, margin=margin)
+                self.reward = self.models["reward_model"] = model.to(self.device)
+            elif reward == "builtin":
+                self.reward = task.imagined_reward
+            else:
+                found = _transitions(task, self.device)
+                self.reward = _function("reward", reward, found, search_path)
+            if self.own_termination:
+                _ = task.terminates  # an environment of elsewhere may not tell
+            if termination == "learned":
+                ends = TerminationModel(n, **networks, std_floor=std_floor).to(self.device)
+                self._termination = self.models["termination_model"] = ends
+            elif termination not in TERMINATIONS:
+                states = _transitions(task, self.device)[2:]
+                self._termination = _function("termination", termination, states, search_path)
+        self.optimizers = {
+            name: torch.optim.Adam(model.parameters(), lr=self.fit_config.learning_rate, fused=True)
+            for name, model in self.models.items()
+        }
+
+    @property
+    def learns_terminations(self) -> bool:
+        """Whether data must say where episodes terminated."""
+        return "termination_model" in self.models
+
+    def terminated(self, builtin: Termination | None) -> Termination | None:
+        """What ends imagined trajectories; nothing does if ``None``.
+
+        Args:
+            builtin: what the algorithm takes of its task, if it is to.
+        """
+        return builtin if self.own_termination else self._termination
+
+    def fit(self, buffer: ReplayBuffer, action_key: str, iteration: int) -> dict[str, float]:
+        """Fit what is learned to all data, from the weights that it has; returns its metrics.
+
+        Args:
+            buffer: transitions with the flag ``validation``.
+            action_key: of the action that the dynamics are fitted to.
+            iteration: the outer iteration, for the random numbers.
+        """
+        if not self.models:
+            return {}
+        keys = ("observation", action_key, ("next", "observation"), ("next", "reward"))
+        setting = "fit.validation_fraction"
+        train, validation = (
+            part[_finite(part, *keys)]
+            for part in split_validation(buffer, "fit rewards", "transitions", setting)
+        )
+        metrics: dict[str, float] = {}
+        with self._stream("iteration", iteration):
+            for name, model in self.models.items():
+                arguments = (train, validation, self.fit_config, self.optimizers[name])
+                if isinstance(model, RewardModel):
+                    learned = fit_reward(model, *arguments, action_key)
+                    metrics |= {
+                        f"{name}/validation_loss": learned.fit.validation_loss,
+                        f"{name}/explained_variance": learned.explained_variance,
+                    }
+                else:
+                    ends = fit_termination(model, *arguments)
+                    metrics |= {
+                        f"{name}/validation_loss": ends.fit.validation_loss,
+                        f"{name}/terminal": ends.terminal,
+                        f"{name}/missed": ends.missed,
+                        f"{name}/false_alarms": ends.false_alarms,
+                    }
+        return metrics
+
+    @contextmanager
+    def _stream(self, *names: str | int) -> Iterator[None]:
+        """Random numbers of their own; the global ones go on as if nothing had been drawn."""
+        on_cpu = self.device.type == "cpu"
+        with torch.random.fork_rng(devices=[] if on_cpu else [self.device]):
+            seed_streams(self.seed, "outcomes", *names)
+            yield
+
+    def weights(self) -> dict[str, dict[str, Any]]:
+        """State dicts of the models, by their names."""
+        return {name: model.state_dict() for name, model in self.models.items()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to continue; nothing where nothing is learned."""
+        return {
+            name: {"model": model.state_dict(), "optimizer": self.optimizers[name].state_dict()}
+            for name, model in self.models.items()
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        for name, model in self.models.items():
+            model.load_state_dict(state[name]["model"])
+            self.optimizers[name].load_state_dict(state[name]["optimizer"])
+
+
+def _finite(data: TensorDictBase, *keys: NestedKey) -> Tensor:
+    """Which rows of ``[N]`` are finite under all keys: ``(N,)``."""
+    return torch.stack([data[key].isfinite().flatten(1).all(1) for key in keys]).all(0)
+
+
+def _transitions(task: AnyTask, device: torch.device) -> list[Tensor]:
+    """Observations, actions and next observations of batch size ``[4, 2]`` to try functions on."""
+    assert isinstance(task, (Task, ExternalTask))
+    sample = StartStates(task) if isinstance(task, Task) else task.sample_starts
+    start = sample(16).to(device)
+    share = torch.rand(8, task.action_dim)
+    low, high = action_bounds(task)
+    action = low + (high - low) * share
+    return [part.unflatten(0, (4, 2)) for part in (start[:8], action.to(device), start[8:])]
+
+
+def _function(
+    name: str, value: str, transitions: list[Tensor], search_path: Sequence[str] = ()
+) -> Callable[..., Tensor]:
+    """A user's function, which must be batched torch and give numbers of the right kind.
+
+    Raises:
+        ValueError: in one line, naming the setting.
+    """
+    try:
+        function = load_attribute(value, search_path)
+    # A file may fail in any way.
+    except Exception as error:
+        why = " ".join(str(error).split())[:200]
+        raise ValueError(f"{name}={value}: {why}") from error
+    if not callable(function):
+        raise ValueError(f"{name}={value} names a {type(function).__name__}, no function")
+    wanted = torch.float32 if name == "reward" else torch.bool
+    arguments = "observation, action, next_observation" if name == "reward" else "next_observation"
+    for inputs in (transitions, [part.flatten(0, 1) for part in transitions]):
+        shape = tuple(inputs[0].shape[:-1])
+        try:
+            found = function(*inputs)
+        # Whatever the user's own code raises.
+        except Exception as error:
+            why = " ".join(str(error).split())[:200]
+            raise ValueError(
+                f"{name}={value}: {name}({arguments}) failed on tensors of shape {shape} + "
+                f"(width,) with {type(error).__name__}: {why}"
+            ) from error
+        if not isinstance(found, Tensor):
+            raise ValueError(f"{name}={value} must return a tensor, got {type(found).__name__}")
+        if tuple(found.shape) != shape:
+            raise ValueError(
+                f"{name}={value} must return shape (...) for tensors of shape (..., width), got "
+                f"{tuple(found.shape)} for {shape} + (width,): take entries as x[..., 0] and sum "
+                "over dimension -1"
+            )
+        if found.dtype != wanted:
+            raise ValueError(f"{name}={value} must return {wanted}, got {found.dtype}")
+        if not bool(found.isfinite().all()):
+            raise ValueError(f"{name}={value} is not finite at the task's initial states")
+    return function

@@ -1,0 +1,89 @@
+"""``torchrl-l1 new-task``: write a recipe for an environment, with what was found in comments."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from torchrl_l1.envs import AnyTask, ExternalTask, get_task
+from torchrl_l1.envs.references import folders_of
+from torchrl_l1.experiment.files import write_atomically
+from torchrl_l1.experiment.trial import describe
+
+ALGORITHMS = ("pets", "dets", "metrpo", "mbmf")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``torchrl-l1 new-task``."""
+    add = parser.add_argument
+    add("file", help="the recipe to write, such as my_task.yaml")
+    add(
+        "--from",
+        dest="source",
+        required=True,
+        metavar="ENV",
+        help="gymnasium/ID, PACKAGE:ID, dm_control/DOMAIN/TASK, MODULE:FUNCTION or "
+        "FILE.py:FUNCTION",
+    )
+    add("--algorithm", choices=ALGORITHMS, default=ALGORITHMS[0], help="what shall learn")
+    add("--dt", type=float, help="seconds of a step, where the environment does not tell")
+    add("--horizon", type=int, help="steps of an episode, where the environment does not tell")
+    add("--observation-keys", nargs="+", default=[], help="parts that make the observation")
+
+
+def new_task_command(options: argparse.Namespace) -> None:
+    """``torchrl-l1 new-task``: the file, and what was found."""
+    file = Path(options.file)
+    if file.suffix != ".yaml":
+        raise ValueError(f"{file} must end in .yaml")
+    if file.exists():
+        raise ValueError(f"{file} exists already; choose another name")
+    folders = folders_of([options.source], [file.parent, Path.cwd()])
+    task = get_task(
+        options.source,
+        dt=options.dt,
+        horizon=options.horizon,
+        observation_keys=options.observation_keys,
+        search_path=folders,
+    )
+    for line in describe(task):
+        print(line)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(file, recipe_text(options, task))
+    print(f"Recipe: {file}\nTry it for a minute: torchrl-l1 check {file}")
+
+
+def recipe_text(options: argparse.Namespace, task: AnyTask) -> str:
+    """The recipe, with comments."""
+    known = not isinstance(task, ExternalTask) or task.outcome is not None
+    word = "builtin" if known else "learned"
+    note = task.outcome.note if isinstance(task, ExternalTask) and task.outcome is not None else ""
+    keys = ", ".join(options.observation_keys)
+    lines = [
+        f"# {options.algorithm.upper()} on {options.source}:",
+        *(f"#   {line}" for line in describe(task)),
+        f"# torchrl-l1 check {options.file} tries it, torchrl-l1 run {options.file} trains.",
+        "defaults:",
+        f"  - /{options.algorithm}/any@_global_",
+        "  - _self_",
+        "",
+        f"recipe: {Path(options.file).stem}",
+        f"task: {options.source}",
+        f"dt: {options.dt:g}  # seconds of a step" if options.dt else "# dt: the environment tells",
+        f"horizon: {options.horizon}  # steps of an episode"
+        if options.horizon
+        else f"# horizon: {task.horizon}  # fewer steps make shorter episodes",
+        f"observation_keys: [{keys}]"
+        if keys
+        else "# observation_keys: [..]  # where the observation comes in parts",
+        "",
+        "# What imagined steps earn, and where they end: builtin, learned, or MODULE:FUNCTION and",
+        "# FILE.py:FUNCTION in torch; a termination may be none.",
+        f"reward: {word}" + (f"  # {note}" if note else ""),
+        f"termination: {word}",
+        "",
+        "# L1 is off; turn it on with l1=robust, which needs no tuning, on the command line.",
+        "outer_iterations: 20",
+        "",
+    ]
+    return "\n".join(lines)

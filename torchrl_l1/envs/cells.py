@@ -1,0 +1,255 @@
+"""Single environments of elsewhere, whatever library they come from, NumPy in and NumPy out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import gymnasium
+import mujoco
+import numpy as np
+import torch
+from gymnasium.spaces import Box, Dict
+from tensordict import TensorDictBase
+from torchrl.data import Bounded
+from torchrl.envs import EnvBase, GymWrapper, StepCounter, TransformedEnv
+from torchrl.envs.utils import step_mdp
+
+from torchrl_l1.control import time_step
+from torchrl_l1.envs.known_rewards import Outcome, known_outcome
+from torchrl_l1.envs.sources import check_keys, simulation_of, vector_environment, vectors
+
+PAGE = "see the page on environments"
+"""Where the forms of environments are explained."""
+
+# Beyond it a bound is none: some packages write the largest float for infinity.
+_LARGEST_BOUND = 1e9
+
+
+class Cell(Protocol):
+    """One environment, every reset of which has a seed of its own.
+
+    Attributes:
+        low: lower bounds of the action ``(m,)``.
+        high: upper bounds.
+        observation_dim: width of the observation.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    observation_dim: int
+
+    def reset(self, seed: int) -> np.ndarray:
+        """Start an episode; the observation ``(n,)``, float32."""
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
+        """Observation ``(n,)``, reward, and whether the episode has terminated or is truncated."""
+
+    def time_step(self) -> float | None:
+        """Seconds of a step, as far as the environment tells."""
+
+    def horizon(self) -> int | None:
+        """Steps of an episode, as far as the environment tells."""
+
+    def simulation(self) -> Any:
+        """What has MuJoCo's ``model`` and ``data``, where it is one of Gymnasium's."""
+
+    def outcome(self) -> Outcome | None:
+        """Reward and termination as functions of the observation, where they are known."""
+
+    def close(self) -> None:
+        """Free what it holds."""
+
+
+class GymnasiumCell:
+    """An environment of Gymnasium, without TorchRL between."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], name: str, keys: Sequence[str]) -> None:
+        self.env, self._name, self._keys = env, name, tuple(keys)
+        space = env.action_space
+        if not isinstance(space, Box) or not np.issubdtype(space.dtype, np.floating):
+            raise ValueError(_no_actions(name, space))
+        if len(space.shape) != 1:
+            raise ValueError(_no_actions(name, f"an array of the shape {space.shape}"))
+        self._type = space.dtype
+        self.low, self.high = _checked_bounds(name, space.low, space.high)
+        self.observation_dim = self._read_observation_space()
+
+    def _read_observation_space(self) -> int:
+        space, name = self.env.observation_space, self._name
+        if not isinstance(space, Dict):
+            check_keys(self._keys, (), name)
+            if not isinstance(space, Box) or len(space.shape) != 1:
+                images = isinstance(space, Box) and len(space.shape) > 1
+                raise ValueError(
+                    f"{name} has {'images or tables' if images else space} as observations; a "
+                    f"vector of numbers is needed ({PAGE})"
+                )
+            return int(space.shape[0])
+        parts = {
+            key: part
+            for key, part in space.spaces.items()
+            if isinstance(part, Box) and len(part.shape) <= 1
+        }
+        check_keys(self._keys, parts, name)
+        self._keys = self._keys or _whole(name, list(parts))
+        return sum(int(np.prod(parts[key].shape)) for key in self._keys)
+
+    def _observed(self, observation: Any) -> np.ndarray:
+        if self._keys:
+            observation = np.concatenate([np.ravel(observation[key]) for key in self._keys])
+        return np.asarray(observation, dtype=np.float32)
+
+    def reset(self, seed: int) -> np.ndarray:
+        """See :class:`Cell`."""
+        return self._observed(self.env.reset(seed=seed)[0])
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
+        """See :class:`Cell`."""
+        observation, reward, terminated, truncated, _ = self.env.step(action.astype(self._type))
+        # Some give an array with one number.
+        earned = np.asarray(reward, dtype=np.float64).item()
+        return self._observed(observation), earned, bool(terminated), bool(truncated)
+
+    def time_step(self) -> float | None:
+        """See :class:`Cell`."""
+        return time_step(GymWrapper(self.env))
+
+    def horizon(self) -> int | None:
+        """See :class:`Cell`."""
+        env: Any = self.env
+        while env is not env.unwrapped:
+            limit = env.__dict__.get("_max_episode_steps")
+            if isinstance(limit, int) and limit > 0:
+                return limit
+            env = env.env
+        spec = self.env.spec
+        return None if spec is None else spec.max_episode_steps
+
+    def simulation(self) -> Any:
+        """See :class:`Cell`."""
+        inner: Any = self.env.unwrapped
+        return inner if isinstance(getattr(inner, "model", None), mujoco.MjModel) else None
+
+    def outcome(self) -> Outcome | None:
+        """See :class:`Cell`."""
+        return None if self._keys else known_outcome(self.env)
+
+    def close(self) -> None:
+        """See :class:`Cell`."""
+        self.env.close()
+
+
+class TorchRLCell:
+    """An environment of TorchRL."""
+
+    def __init__(self, env: EnvBase, name: str, keys: Sequence[str]) -> None:
+        if tuple(env.batch_size) not in ((), (1,)):
+            raise ValueError(
+                f"{name} is a batch of {tuple(env.batch_size)} environments; let it return a "
+                "single one, which is made as often as it is needed"
+            )
+        parts = vectors(env)
+        if not keys and "observation" in parts:
+            keys = ("observation",) if len(parts) == 1 else _whole(name, list(parts))
+        try:
+            self.env = vector_environment(env, keys)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error} ({PAGE})") from None
+        spec = self.env.action_spec
+        if not isinstance(spec, Bounded):
+            raise ValueError(_unbounded(name, "no bounds"))
+        low, high = (np.ravel(bound.numpy()) for bound in (spec.space.low, spec.space.high))
+        self.low, self.high = _checked_bounds(name, low, high)
+        self.observation_dim = int(self.env.observation_spec["observation"].shape[-1])
+
+    def reset(self, seed: int) -> np.ndarray:
+        """See :class:`Cell`."""
+        # Some draw from torch's global generator; what a policy draws must not start anew.
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.env.set_seed(seed)
+            self._state = self.env.reset()
+        return self._observed(self._state)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
+        """See :class:`Cell`."""
+        given = torch.from_numpy(action).reshape(self.env.action_spec.shape)
+        data = self.env.step(self._state.set("action", given))
+        self._state = step_mdp(data)
+        stepped = data["next"]
+        ended, truncated = bool(stepped["done"].any()), stepped.get("truncated", None)
+        late = truncated is not None and bool(truncated.any())
+        terminated = stepped.get("terminated", None)
+        over = ended and not late if terminated is None else bool(terminated.any())
+        return self._observed(stepped), float(stepped["reward"].sum()), over, late or ended
+
+    def _observed(self, data: TensorDictBase) -> np.ndarray:
+        observation: np.ndarray = data["observation"].reshape(-1).float().numpy().copy()
+        return observation
+
+    def time_step(self) -> float | None:
+        """See :class:`Cell`."""
+        return time_step(self.env)
+
+    def horizon(self) -> int | None:
+        """See :class:`Cell`."""
+        env, limits = self.env, []
+        while isinstance(env, TransformedEnv):
+            limits += [t.max_steps for t in env.transform.modules() if isinstance(t, StepCounter)]
+            env = env.base_env
+        inner = getattr(env, "_env", None)  # Gymnasium's or dm_control's
+        spec = getattr(inner, "spec", None)
+        limits += [getattr(env, "max_steps", None), getattr(inner, "_step_limit", None)]
+        limits.append(getattr(spec, "max_episode_steps", None))
+        found = [int(x) for x in limits if isinstance(x, (int, float)) and 0 < x < float("inf")]
+        return min(found) if found else None
+
+    def simulation(self) -> Any:
+        """See :class:`Cell`."""
+        return simulation_of(self.env)
+
+    def outcome(self) -> Outcome | None:
+        """See :class:`Cell`."""
+        return None
+
+    def close(self) -> None:
+        """See :class:`Cell`."""
+        self.env.close(raise_if_closed=False)
+
+
+def _no_actions(name: str, found: object) -> str:
+    return (
+        f"{name} has {found} as actions; planning, policies and L1 need a vector of continuous "
+        f"ones ({PAGE})"
+    )
+
+
+def _unbounded(name: str, found: str) -> str:
+    return (
+        f"{name} has unbounded actions ({found}); planning and random data need bounds: give its "
+        f"action space some, or wrap it ({PAGE})"
+    )
+
+
+def _checked_bounds(name: str, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    low, high = low.astype(np.float32), high.astype(np.float32)
+    if not (np.abs(low) < _LARGEST_BOUND).all() or not (np.abs(high) < _LARGEST_BOUND).all():
+        raise ValueError(_unbounded(name, f"{low.tolist()} to {high.tolist()}"))
+    if not (low < high).all():
+        raise ValueError(f"{name} has empty action bounds: {low.tolist()} to {high.tolist()}")
+    return low, high
+
+
+def _whole(name: str, parts: Sequence[str]) -> tuple[str, ...]:
+    """All parts of an observation in the order of their names, unless that needs a choice."""
+    if not parts:
+        raise ValueError(
+            f"{name} has no vectors in its observations; a vector of numbers is needed ({PAGE})"
+        )
+    if "observation" in parts and len(parts) > 1:
+        raise ValueError(
+            f"{name} has the observations {', '.join(sorted(parts))}: say which make the state, "
+            f"such as observation_keys=[{','.join(parts)}] ({PAGE})"
+        )
+    return tuple(sorted(parts))

@@ -1,0 +1,316 @@
+"""Tasks of elsewhere: what algorithms need to know of one, read from the environment itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, GymEnv, GymWrapper
+
+from torchrl_l1.envs.cells import PAGE, Cell, GymnasiumCell, TorchRLCell
+from torchrl_l1.envs.known_rewards import Outcome
+from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
+from torchrl_l1.envs.plant import disturbed_model
+from torchrl_l1.envs.sources import EnvironmentSource, environment_source
+from torchrl_l1.envs.task import RewardFn, Scalars, Task
+
+
+class ExternalTask:
+    """What algorithms need to know of an environment that is no task of ours.
+
+    It stands beside :class:`Task`: widths, bounds, time step and horizon are read from the
+    environment, which is made as often as episodes are collected side by side.
+
+    Args:
+        source: makes the environment.
+        dt: seconds of a step, where the environment does not tell.
+        horizon: steps of an episode, where the environment does not tell, or fewer.
+        observation_keys: parts of an observation that comes in parts, in this order.
+
+    Attributes:
+        name: of the source.
+        observation_dim: width of the observation.
+        action_dim: width of the action.
+        action_low: lower bound of the actions, one number where all entries have the same.
+        action_high: upper bound.
+        outcome: reward and termination, where they are known functions of the observation.
+
+    Raises:
+        ValueError: for an environment that no algorithm here can act in, or one that does not tell
+            what must be known, with the setting to give.
+
+    Examples:
+        >>> task = ExternalTask(environment_source("gymnasium/Pendulum-v1"))
+        >>> task.dt, task.horizon, task.action_low, task.action_high
+        (0.05, 200, -2.0, 2.0)
+    """
+
+    def __init__(
+        self,
+        source: EnvironmentSource,
+        *,
+        dt: float | None = None,
+        horizon: int | None = None,
+        observation_keys: Sequence[str] = (),
+    ) -> None:
+        self.source, self.name = source, source.name or "the environment"
+        self._keys = tuple(observation_keys)
+        cell = self._cell()
+        try:
+            self.observation_dim = cell.observation_dim
+            self.action_dim = len(cell.low)
+            self.action_low, self.action_high = _scalars(cell.low), _scalars(cell.high)
+            self.dt = self._told("dt", "SECONDS", "how long a step takes", dt, cell.time_step())
+            if dt is not None and abs(dt - self.dt) > 1e-6 * self.dt:
+                raise ValueError(f"dt: a step of {self.name} takes {self.dt:g} s, not {dt:g}")
+            self.horizon = horizon or self._told(
+                "horizon", "STEPS", "how long an episode is", None, cell.horizon()
+            )
+            self.outcome = cell.outcome()
+            self.has_plant = cell.simulation() is not None
+        finally:
+            cell.close()
+
+    def _told(self, key: str, unit: str, what: str, given: Any, told: Any) -> Any:
+        if told is None and given is None:
+            raise ValueError(f"{self.name} does not tell {what}: give {key}={unit} ({PAGE})")
+        return given if told is None else told
+
+    def _cell(self, limited: bool = True) -> Cell:
+        """One environment, by itself.
+
+        Args:
+            limited: whether episodes end when the environment's own horizon says so.
+        """
+        if self.source.gymnasium_id:
+            options: dict[str, Any] = {} if limited else {"max_episode_steps": -1}
+            made = gymnasium.make(self.source.gymnasium_id, disable_env_checker=True, **options)
+            return GymnasiumCell(made, self.name, self._keys)
+        env = self.source.build()
+        plain = type(env) in (GymEnv, GymWrapper) and getattr(env, "wrapper_frame_skip", 1) == 1
+        if plain and isinstance(env._env, gymnasium.Env):
+            return GymnasiumCell(env._env, self.name, self._keys)
+        return TorchRLCell(env, self.name, self._keys)
+
+    @property
+    def imagined_reward(self) -> RewardFn:
+        """Reward as a function of the observation, if there is a built-in one.
+
+        Raises:
+            ValueError: if there is none.
+        """
+        return self._known("reward").reward
+
+    @property
+    def terminated(self) -> Callable[[Tensor], Tensor]:
+        """Termination as a function of the observation, if there is a built-in one.
+
+        Raises:
+            ValueError: if there is none.
+        """
+        return self._known("termination").terminated
+
+    @property
+    def terminates(self) -> bool:
+        """Whether any state ends an episode."""
+        return self._known("termination").terminates
+
+    def _known(self, what: str) -> Outcome:
+        if self.outcome is None:
+            none = ", none" if what == "termination" else ""
+            raise ValueError(
+                f"{what}: there is no built-in one for {self.name}; say {what}=learned{none} or "
+                f"{what}=MODULE:FUNCTION ({PAGE})"
+            )
+        return self.outcome
+
+    def sample_starts(self, count: int) -> Tensor:
+        """First observations of so many episodes ``(count, n)``, seeded by torch's generator."""
+        env = self.environment(1)
+        starts = [env.reset()["observation"] for _ in range(count)]
+        env.close()
+        return torch.cat(starts)
+
+    def check_disturbances(self, names: Sequence[str]) -> None:
+        """Refuse changes of a plant that cannot be reached.
+
+        Raises:
+            ValueError: naming the disturbance.
+        """
+        for name in names:
+            if not self.has_plant or name == "wind":  # which Gymnasium's resets would undo
+                raise ValueError(
+                    f"{name} changes the plant, which needs a task of ours or one of Gymnasium's "
+                    f"MuJoCo environments{' and no wind' * (name == 'wind')}, not {self.name}: "
+                    "leave it out"
+                )
+
+    def environment(self, num_envs: int, **settings: Any) -> ExternalEnv:
+        """So many environments side by side, see :class:`ExternalEnv`."""
+        return ExternalEnv(self, num_envs, **settings)
+
+
+def _scalars(bound: np.ndarray) -> Scalars:
+    entries = tuple(float(value) for value in bound)
+    return entries[0] if len(set(entries)) == 1 else entries
+
+
+class ExternalEnv(EnvBase):
+    """Environments of elsewhere side by side in one process, as :class:`BatchedMujocoEnv` has ours.
+
+    Every reset of each is seeded from the seed of the whole, so that what follows depends on
+    nothing that was before. Actions are clipped to the bounds, as an actuator would. Where an
+    observation or reward is not finite, that step has ``("next", "non_finite")`` and
+    ``("next", "terminated")`` set, its next observation repeats the last good one and its reward is
+    zero.
+
+    Args:
+        task: what the environments are.
+        num_envs: how many; the batch size is ``[num_envs]``.
+
+    Keyword Args:
+        seed: seed of the resets; drawn from torch's global generator if ``None``.
+        max_steps: steps after which an episode is truncated; the task's horizon if ``None``.
+        dtype: floating dtype of observation, action and reward.
+        threads: no more than one thread steps them.
+        plant: changes of the plant by name, numbers, of Gymnasium's MuJoCo environments.
+
+    Raises:
+        ValueError: if a count is not positive, or for a plant that cannot be changed so.
+
+    Examples:
+        >>> env = ExternalTask(environment_source("gymnasium/Pendulum-v1")).environment(3, seed=0)
+        >>> env.rollout(5)["next", "reward"].shape
+        torch.Size([3, 5, 1])
+    """
+
+    def __init__(
+        self,
+        task: ExternalTask,
+        num_envs: int = 1,
+        *,
+        seed: int | None = None,
+        max_steps: int | None = None,
+        dtype: torch.dtype = torch.float32,
+        threads: int = 1,
+        plant: Mapping[str, Any] | None = None,
+    ) -> None:
+        max_steps = task.horizon if max_steps is None else max_steps
+        for name, value in {"num_envs": num_envs, "max_steps": max_steps}.items():
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        super().__init__(device="cpu", batch_size=[num_envs])
+        self.task, self.num_envs, self.max_steps, self._dtype = task, num_envs, max_steps, dtype
+        task.check_disturbances(list(plant or {}))
+        self.cells = [task._cell(limited=False) for _ in range(num_envs)]
+        for cell in self.cells:
+            if plant:
+                simulation = cell.simulation()
+                simulation.model = disturbed_model(simulation.model, plant)
+        self._low = np.stack([cell.low for cell in self.cells])
+        self._high = np.stack([cell.high for cell in self.cells])
+        self._steps = np.zeros(num_envs, dtype=np.int64)
+        self._observation = np.zeros((num_envs, task.observation_dim), dtype=np.float32)
+        self._make_specs()
+        self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
+
+    def _make_specs(self) -> None:
+        batch, dtype = self.batch_size, self._dtype
+        self.observation_spec = Composite(
+            observation=Unbounded((*batch, self.task.observation_dim), dtype=dtype),
+            non_finite=Binary(shape=(*batch, 1), dtype=torch.bool),
+            shape=batch,
+        )
+        low, high = (torch.from_numpy(bound).to(dtype) for bound in (self._low, self._high))
+        self.action_spec = Bounded(low, high, low.shape, dtype=dtype)
+        self.reward_spec = Unbounded((*batch, 1), dtype=dtype)
+        flags = ("done", "terminated", "truncated")
+        flag = Binary(shape=(*batch, 1), dtype=torch.bool)
+        self.full_done_spec = Composite({key: flag.clone() for key in flags}, shape=batch)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._rng = np.random.default_rng(seed)
+
+    def _emitted(self) -> Tensor:
+        return torch.from_numpy(self._observation.copy()).to(self._dtype)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        indices = np.arange(self.num_envs)
+        if mask is not None:
+            indices = np.flatnonzero(mask.reshape(self.num_envs, -1).any(-1).numpy())
+        for index in indices:
+            self._observation[index] = self.cells[index].reset(int(self._rng.integers(2**31)))
+        self._steps[indices] = 0
+        return self._data({}, *(np.zeros(self.num_envs, dtype=bool) for _ in range(3)))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        actions = tensordict.get("action").detach().float().numpy().clip(self._low, self._high)
+        if not np.isfinite(actions).all():
+            raise ValueError("'action' is not finite; check the policy's output")
+        reward = np.zeros(self.num_envs, dtype=np.float32)
+        bad, terminated, truncated = (np.zeros(self.num_envs, dtype=bool) for _ in range(3))
+        for index, (cell, action) in enumerate(zip(self.cells, actions, strict=True)):
+            observation, earned, terminated[index], truncated[index] = cell.step(action)
+            bad[index] = not (np.isfinite(observation).all() and np.isfinite(earned))
+            if not bad[index]:
+                self._observation[index], reward[index] = observation, earned
+        self._steps += 1
+        truncated |= self._steps >= self.max_steps
+        earned_ = {"reward": torch.from_numpy(reward).unsqueeze(-1).to(self._dtype)}
+        return self._data(earned_, bad, terminated | bad, truncated)
+
+    def _data(
+        self,
+        more: Mapping[str, Tensor],
+        bad: np.ndarray,
+        terminated: np.ndarray,
+        truncated: np.ndarray,
+    ) -> TensorDict:
+        flags = {
+            "non_finite": bad,
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": terminated | truncated,
+        }
+        columns = {name: torch.from_numpy(flag).unsqueeze(-1) for name, flag in flags.items()}
+        return TensorDict(
+            {"observation": self._emitted(), **columns, **more},
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Free all environments."""
+        for cell in self.cells:
+            cell.close()
+        super().close(raise_if_closed=raise_if_closed)
+
+
+@cache
+def external_task(
+    name: str,
+    dt: float | None = None,
+    horizon: int | None = None,
+    observation_keys: tuple[str, ...] = (),
+    search_path: tuple[str | Path, ...] = (),
+) -> Task | ExternalTask:
+    """The task that an environment of that name is; a :class:`Task` where a function returns one.
+
+    Raises:
+        ValueError: for a name that stands for nothing, or an environment that will not do.
+    """
+    source = environment_source(name, search_path)
+    if source.task is not None:
+        return source.task
+    if not source.gymnasium_id and isinstance(env := source.build(), BatchedMujocoEnv):
+        return env.task
+    return ExternalTask(source, dt=dt, horizon=horizon, observation_keys=observation_keys)

@@ -1,0 +1,133 @@
+"""Names of what users bring along: ``MODULE:NAME`` and ``FILE.py:NAME``."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Iterable, Sequence
+from functools import cache
+from importlib import import_module, invalidate_caches
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+
+def require(module: str, extra: str) -> ModuleType:
+    """Import a package that is not needed by all.
+
+    Raises:
+        ValueError: if it is not there, with the extra that brings it.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise ValueError(
+            f"{module} cannot be imported ({error}): pip install 'torchrl-l1[{extra}]'"
+        ) from None
+
+
+def load_attribute(name: str, search_path: Sequence[str | Path] = ()) -> Any:
+    """What ``MODULE:NAME`` or ``FILE.py:NAME`` names.
+
+    Args:
+        name: such as ``my_package.envs:make_env`` or ``envs.py:make_env``.
+        search_path: folders in which files are looked for, and modules that Python's own path does
+            not have; after them, the working directory.
+
+    Raises:
+        ValueError: if there is none.
+
+    Examples:
+        >>> load_attribute("math:hypot")(3, 4)
+        5.0
+    """
+    module, _, attribute = name.rpartition(":")
+    found = find_attribute(name, search_path)
+    if found is None:
+        raise ValueError(f"{module} has no {attribute!r}")
+    return found
+
+
+def find_attribute(name: str, search_path: Sequence[str | Path] = ()) -> Any:
+    """As :func:`load_attribute`; ``None`` where there is the module, but not the name in it."""
+    module, _, attribute = name.rpartition(":")
+    return getattr(load_module(module, search_path), attribute, None)
+
+
+def load_module(name: str, search_path: Sequence[str | Path] = ()) -> ModuleType:
+    """A module, by its name or its file.
+
+    Raises:
+        ValueError: if it is not there, or cannot be imported.
+    """
+    if name.endswith(".py"):
+        file = next((place for place in _places(name, search_path) if place.is_file()), None)
+        if file is None:
+            where = ", ".join(
+                dict.fromkeys(str(place.parent) for place in _places(name, search_path))
+            )
+            raise ValueError(f"there is no file {name} (looked for in {where})")
+        return _of_file(file.resolve(), file.stat().st_mtime_ns)
+    _extend_path(name.partition(".")[0], search_path)
+    try:
+        return import_module(name)
+    except (ImportError, TypeError, ValueError) as error:
+        raise ValueError(f"there is no module {name!r} ({error})") from None
+
+
+def folders_of(names: Iterable[str], folders: Iterable[Path]) -> list[str]:
+    """Those folders that hold what one of these names begins with.
+
+    A name that begins with a package of Python's own path needs no folder.
+
+    Args:
+        names: such as ``envs.py:make_env``, ``my_package:MyEnv-v0`` or ``gymnasium/Reacher-v5``.
+        folders: where to look.
+    """
+    found = []
+    for folder in dict.fromkeys(folder.resolve() for folder in folders):
+        for name in names:
+            module = name.removeprefix("gymnasium/").rpartition(":")[0]
+            if module.endswith(".py"):
+                there = not Path(module).is_absolute() and (folder / module).is_file()
+            else:
+                there = bool(module) and _holds(folder, module.partition(".")[0])
+            if there and str(folder) not in found:
+                found.append(str(folder))
+    return found
+
+
+def _places(name: str, search_path: Sequence[str | Path]) -> list[Path]:
+    return [Path(folder, name) for folder in (*search_path, Path.cwd())]
+
+
+def _extend_path(package: str, search_path: Sequence[str | Path]) -> None:
+    """Let Python find a package that only the search path has, now and in later imports."""
+    if package in sys.modules:
+        return
+    invalidate_caches()
+    try:
+        if importlib.util.find_spec(package) is not None:
+            return
+    except (ImportError, ValueError):
+        return
+    for folder in (*map(Path, search_path), Path.cwd()):
+        if _holds(folder, package):
+            sys.path.append(str(folder.resolve()))
+            return
+
+
+def _holds(folder: Path, package: str) -> bool:
+    return (folder / f"{package}.py").is_file() or (folder / package).is_dir()
+
+
+@cache
+def _of_file(file: Path, changed: int) -> ModuleType:
+    """Loaded once, and again where it has changed."""
+    spec = importlib.util.spec_from_file_location(file.stem, file)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    # As of an import: what the file defines may look its own module up.
+    sys.modules.setdefault(file.stem, module)
+    spec.loader.exec_module(module)
+    return module
