@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from torchrl_l1.algorithms import DatasetColumns
 from torchrl_l1.dynamics import read_csv, read_minari, read_npz
-from torchrl_l1.envs import Task
+from torchrl_l1.envs import AnyTask, action_bounds
 from torchrl_l1.experiment.checkpoints import read_checkpoint
 from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.registration import EPISODE_STEPS, gymnasium_id
@@ -261,7 +261,7 @@ def split_episodes(data: TensorDictBase) -> list[Episode]:
     return episodes
 
 
-def write_dataset(output: str, episodes: Sequence[Episode], task: Task, algorithm: str) -> str:
+def write_dataset(output: str, episodes: Sequence[Episode], task: AnyTask, algorithm: str) -> str:
     """Write episodes where :func:`read_dataset` finds them again.
 
     Args:
@@ -367,7 +367,7 @@ def _transitions(episodes: Sequence[Episode]) -> TensorDict:
     )
 
 
-def _write_minari(name: str, episodes: Sequence[Episode], task: Task, algorithm: str) -> None:
+def _write_minari(name: str, episodes: Sequence[Episode], task: AnyTask, algorithm: str) -> None:
     import minari
     from gymnasium.spaces import Box
     from minari.data_collector.episode_buffer import EpisodeBuffer
@@ -384,12 +384,12 @@ def _write_minari(name: str, episodes: Sequence[Episode], task: Task, algorithm:
         )
         for number, episode in enumerate(episodes)
     ]
-    n, m = task.observation_dim, task.action_dim
+    low, high = (bound.numpy() for bound in action_bounds(task))
     minari.create_dataset_from_buffers(
         name,
         buffers,
         env=gymnasium_id(task.name) if task.name in EPISODE_STEPS else None,
-        observation_space=Box(-np.inf, np.inf, (n,), np.float32),
-        action_space=Box(task.action_low, task.action_high, (m,), np.float32),
+        observation_space=Box(-np.inf, np.inf, (task.observation_dim,), np.float32),
+        action_space=Box(low, high, dtype=np.float32),
         algorithm_name=algorithm,
     )

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_l1.algorithms.collection import Collection, episode_returns
-from torchrl_l1.envs import Perturbation, Task
+from torchrl_l1.envs import AnyTask, Perturbation, action_bounds
 from torchrl_l1.experiment.datasets import Episode, split_episodes
 from torchrl_l1.experiment.evaluate import TrainedRun
 
@@ -62,12 +62,12 @@ class NoisyPolicy(TensorDictModuleBase):
         noise: standard deviation, as a fraction of half the range of the action.
     """
 
-    def __init__(self, policy: TensorDictModuleBase, task: Task, noise: float) -> None:
+    def __init__(self, policy: TensorDictModuleBase, task: AnyTask, noise: float) -> None:
         super().__init__()
         self.policy = policy
         self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
-        self.bounds = (task.action_low, task.action_high)
-        self.deviation = noise * (task.action_high - task.action_low) / 2
+        self.bounds = low, high = action_bounds(task)
+        self.deviation = noise * (high - low) / 2
         primer = getattr(policy, "make_tensordict_primer", None)
         if primer is not None:
             self.make_tensordict_primer = primer
