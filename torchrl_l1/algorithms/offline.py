@@ -170,11 +170,6 @@ class Offline(Algorithm):
             return
         if self.data is None:
             raise ValueError("offline learning needs a dataset: set dataset=...")
-        if self.outcomes.models:
-            raise ValueError(
-                "offline learning has no learned rewards and terminations: set reward and "
-                "termination to builtin or to MODULE:FUNCTION"
-            )
         data = self.data() if callable(self.data) else self.data
         label = self.config.label
         executed = label == "executed" and "executed" in data.keys()  # noqa: SIM118
