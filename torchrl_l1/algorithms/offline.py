@@ -33,7 +33,6 @@ from torchrl_l1.algorithms.collection import (
     signal_metrics,
 )
 from torchrl_l1.algorithms.facts import AlgorithmFacts, Phase, Stage
-from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.offline_config import OfflineConfig
 from torchrl_l1.algorithms.outcomes import OUTCOME_METRICS
 from torchrl_l1.algorithms.pessimism import PENALTY_METRICS, Pessimism
@@ -155,7 +154,7 @@ class Offline(Algorithm):
             episodes=config.evaluation_episodes,
             horizon=self.horizon,
         )
-        self.learning = ModelLearning(self.dynamics, config.fit, config.label, capacity=1)
+        self.learning = self.make_learning(capacity=1)
         # What the first outer iteration has found out for all.
         self.known: dict[str, float] = {}
 

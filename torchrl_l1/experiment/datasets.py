@@ -384,12 +384,12 @@ def _write_minari(name: str, episodes: Sequence[Episode], task: AnyTask, algorit
         )
         for number, episode in enumerate(episodes)
     ]
-    low, high = action_bounds(task)
+    low, high = (bound.numpy() for bound in action_bounds(task))
     minari.create_dataset_from_buffers(
         name,
         buffers,
         env=gymnasium_id(task.name) if task.name in EPISODE_STEPS else None,
         observation_space=Box(-np.inf, np.inf, (task.observation_dim,), np.float32),
-        action_space=Box(low.numpy(), high.numpy(), dtype=np.float32),
+        action_space=Box(low, high, dtype=np.float32),
         algorithm_name=algorithm,
     )

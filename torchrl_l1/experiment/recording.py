@@ -66,8 +66,8 @@ class NoisyPolicy(TensorDictModuleBase):
         super().__init__()
         self.policy = policy
         self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
-        self.low, self.high = action_bounds(task)
-        self.deviation = noise * (self.high - self.low) / 2
+        self.bounds = low, high = action_bounds(task)
+        self.deviation = noise * (high - low) / 2
         primer = getattr(policy, "make_tensordict_primer", None)
         if primer is not None:
             self.make_tensordict_primer = primer
@@ -77,7 +77,7 @@ class NoisyPolicy(TensorDictModuleBase):
         tensordict = self.policy(tensordict)
         action = tensordict.get("action")
         noisy = action + self.deviation * torch.randn_like(action)
-        return tensordict.set("action", noisy.clamp(self.low, self.high))
+        return tensordict.set("action", noisy.clamp(*self.bounds))
 
 
 def record(
