@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tests import forked
-from tests.conftest import HAS_FORKS, PRELOADED, Process, _started_anew
+from tests.conftest import HAS_FORKS, PRELOADED, Process, started_anew
 
 SECONDS = 300
 """After which a command counts as hanging."""
@@ -105,7 +105,7 @@ class Command(Process):
             )
         else:
             assert prepare is None
-            self._process = _started_anew(arguments, output)
+            self._process = started_anew(arguments, output)
 
     def poll(self) -> int | None:
         return self._process.poll()
@@ -118,7 +118,7 @@ class Command(Process):
 
     @property
     def pid(self) -> int:
-        return self._process.pid  # type: ignore[attr-defined]
+        return self._process.pid
 
     def end(self) -> Said:
         """Wait for the end, and no longer than is reasonable."""
@@ -135,8 +135,11 @@ class _Forked(Process):
     def __init__(self, process: multiprocessing.process.BaseProcess) -> None:
         self._process = process
         process.start()
-        assert process.pid is not None
-        self.pid = process.pid
+
+    @property
+    def pid(self) -> int:
+        assert self._process.pid is not None
+        return self._process.pid
 
     def poll(self) -> int | None:
         return self._process.exitcode

@@ -126,7 +126,7 @@ def test_a_suite_ends_in_a_table_of_what_is_recovered(
     assert "inverted_pendulum: deterministic policy" in printed
     assert " L1 paper recovered |" in printed
     rows = rows_of(tmp_path / "out" / "evaluation.csv")
-    assert len(rows) == len(suite("quick")) * 3
+    assert len(rows) == len(suite("quick")) * 4
     episodes = rows_of(tmp_path / "out" / "episodes.csv")
     assert len(episodes) == 2 * len(rows)
     assert list(episodes[0])[:4] == ["run", "training_seed", "l1", "noise"]

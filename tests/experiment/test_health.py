@@ -143,7 +143,18 @@ def test_a_signal_ends_the_run_in_order(
 ) -> None:
     number = getattr(signal, name)
     complete, closed = METRPO.complete, []
-    monkeypatch.setattr("torchrl_l1.experiment.run.Tracker.close", lambda self: closed.append(self))
+
+    class Told:
+        def __init__(self, *arguments: Any) -> None:
+            pass
+
+        def log(self, *rows: Any) -> None:
+            pass
+
+        def close(self, status: int = 0) -> None:
+            closed.append(status)
+
+    monkeypatch.setattr("torchrl_l1.experiment.tracking.WandbTracker", Told)
 
     def complete_and_send(self: METRPO, *arguments: Any) -> Any:
         if self.iteration == 1:
@@ -153,10 +164,10 @@ def test_a_signal_ends_the_run_in_order(
     monkeypatch.setattr(METRPO, "complete", complete_and_send)
     before = signal.getsignal(number)
     with pytest.raises(SystemExit) as exit_info, orderly_end():
-        run(tiny_recipe())
+        run(tiny_recipe("wandb.mode=offline"))
     assert exit_info.value.code == 128 + number
     assert capsys.readouterr().err.count(f"torchrl-l1: stopped by {name}\n") == 1
-    assert len(closed) == 1 and signal.getsignal(number) == before
+    assert closed == [1] and signal.getsignal(number) == before
     assert len(rows(tmp_path / "run")) == 1
 
 

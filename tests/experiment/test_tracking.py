@@ -267,7 +267,7 @@ def test_kills_at_random_moments_lose_nothing(
     tmp_path: Path, tiny_overrides: list[str], start_cli: Callable[..., Any]
 ) -> None:
     """Of processes that are forked; ``python -m tests.kills`` does it with whole ones."""
-    settings = [*tiny_overrides, OFFLINE, "outer_iterations=4", "fit.max_epochs=100"]
+    settings = [*tiny_overrides, OFFLINE, "outer_iterations=6", "fit.max_epochs=100"]
     folder = tmp_path / "run"
     command = ["run", "metrpo/inverted_pendulum", *settings, f"run_dir={folder}", "--resume"]
     rng = random.Random(0)
@@ -279,8 +279,9 @@ def test_kills_at_random_moments_lose_nothing(
         process.kill()
         process.wait()
     assert start_cli(command).wait(timeout=300) == 0
-    assert not settled(folder)
-    assert len(wandb_files(folder)) > 1
+    # One file or several: what a killed process has not written yet is removed and logged again.
+    assert not settled(folder) and wandb_files(folder)
+    assert len((folder / "metrics.csv").read_text().splitlines()) == 7
 
 
 def logged(folder: Path, rows: int) -> bool:

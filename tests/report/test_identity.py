@@ -89,12 +89,12 @@ def test_a_run_older_than_the_setting_is_of_metrpo(write_run: WriteRun, tmp_path
 
 def test_every_algorithm_is_known_with_its_ways_to_act() -> None:
     assert set(SCHEMAS) <= set(ALGORITHMS)
-    expected = {"metrpo": True, "mbmf": True, "pets": False, "dets": False}
+    expected = {"metrpo": True, "mbmf": True, "pets": False, "dets": False, "offline": True}
     assert {name: facts(name).samples for name in ALGORITHMS} == expected
     stages = {name: [stage.name for stage in facts(name).named_stages] for name in SCHEMAS}
     # In the order of the stages as users type them.
     assert stages == {
-        "metrpo": [], "pets": [], "mbmf": ["shooting", "cloning", "fine_tuning"],
+        "metrpo": [], "pets": [], "mbmf": ["shooting", "cloning", "fine_tuning"], "offline": [],
     }  # fmt: skip
-    with pytest.raises(ValueError, match="'nothing'; there are metrpo, mbmf, pets, dets"):
+    with pytest.raises(ValueError, match="'nothing'; there are metrpo, mbmf, offline, pets, dets"):
         facts("nothing")
