@@ -177,14 +177,16 @@ def plot(of: dict[str, Returns], file: Path) -> None:
                 row = names.index(name)
                 shares[row, column] = change(returns, l1, cells)[0]
                 word = verdict(returns, l1, cells)
-                mark = {"cancelled": "●", "helped": "+", "worse": "-"}.get(word, "")
-                ax.text(column, row, mark, ha="center", va="center")
+                mark = {"cancelled": "●", "helped": "+", "worse": "–"}.get(word, "")
+                color = "white" if abs(shares[row, column]) > 0.3 else "black"
+                ax.text(column, row, mark, ha="center", va="center", color=color, weight="bold")
         norm = TwoSlopeNorm(0, -0.5, 0.5)
         image = ax.imshow(np.clip(shares, -0.5, 0.5), cmap="RdBu", norm=norm, aspect="auto")
         ax.set_title(f"L1 {l1}")
         tasks = [task.replace("_", " ") for task in of]
         ax.set_xticks(range(len(of)), tasks, rotation=30, ha="right")
         ax.set_yticks(range(len(names)), [DISTURBANCES[name].words for name in names])
+    figure.suptitle("● cancelled   + helped   – worse")
     figure.colorbar(
         image,
         ax=axes,
