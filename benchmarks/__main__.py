@@ -44,7 +44,7 @@ BENCHMARKS: dict[str, tuple[int, int, Callable[[int], Table]]] = {
     "imagination": (imagination.THREADS, 9, imagination.table),
     "trpo": (trpo.THREADS, 15, trpo.table),
     "metrpo_iteration": (metrpo_iteration.THREADS, 5, metrpo_iteration.table),
-    "startup": (startup.THREADS, 5, startup.table),
+    "startup": (startup.THREADS, 3, startup.table),
 }
 
 

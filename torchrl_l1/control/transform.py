@@ -135,7 +135,7 @@ class L1Transform(Transform):
         self.diagnostics = diagnostics
         self.dtype = self.model.dtype if dtype is None else dtype
         self._layout: Layout | None = None
-        self._zero: TensorDictBase | None = None
+        self._zero: tuple[Layout, L1Config, TensorDictBase] | None = None
         self._is_ready = self._is_stateful = False
         self._step_config: L1Config | None = None
         self._step_function: StepFunction | None = None
@@ -293,12 +293,12 @@ class L1Transform(Transform):
             )
 
     def _fresh(self, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        batch_size = tensordict_reset.batch_size
-        if self._zero is None or self._zero.batch_size != batch_size:
-            # Kept, since some environment of a batch is reset at every other step.
-            config = self._settings.config
-            self._zero = self._resolve().zero(batch_size, config, self.diagnostics)
-        fresh = self._zero.clone()
+        batch_size, kept = tensordict_reset.batch_size, self._zero
+        layout, config = self._resolve(), self._settings.config
+        # Kept, since some environment of a batch is reset at every other step.
+        if kept is None or kept[:2] != (layout, config) or kept[2].batch_size != batch_size:
+            kept = self._zero = layout, config, layout.zero(batch_size, config, self.diagnostics)
+        fresh = kept[2].clone()
         self._seal(fresh, tensordict_reset.get(self.observation_key))
         return fresh
 
