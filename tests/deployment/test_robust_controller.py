@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase, GymEnv, TransformedEnv
 import torchrl_l1
 from torchrl_l1.control import L1Transform
 from torchrl_l1.deployment import RobustController, load_target, robustify
+from torchrl_l1.deployment.robust_controller import _source
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.envs import ActuatorBias, make_env
 from torchrl_l1.experiment.run import run
@@ -189,6 +190,23 @@ def test_runs_bring_their_own_model_and_settings(tiny_recipe, tmp_path):
     assert robust.config.filter == "kalman" and robust.source.name == "inverted_pendulum"
     env = robust.wrap(robust.source.single())
     assert env.rollout(3, robust.policy).shape == (1, 3)
+
+
+def test_a_runs_policy_sees_the_parts_of_the_observation_in_its_own_order(tmp_path):
+    (tmp_path / "envs.py").write_text(
+        "import gymnasium\nfrom gymnasium.spaces import Box, Dict\n\n\n"
+        "class Parts(gymnasium.Env):\n"
+        "    action_space = Box(-1, 1, (1,))\n"
+        "    observation_space = Dict(place=Box(-9, 9, (1,)), speed=Box(-9, 9, (1,)))\n\n"
+        "    def reset(self, *, seed=None, options=None):\n"
+        "        return {name: part.low for name, part in self.observation_space.items()}, {}\n"
+    )
+    name = "envs.py:Parts"
+    (tmp_path / "config.yaml").write_text(
+        f"task: {name}\nsearch_path: ['{tmp_path}']\nobservation_keys: [speed, place]\n"
+    )
+    assert _source(name, str(tmp_path)).observation_keys == ("speed", "place")
+    assert _source("gymnasium/Pendulum-v1", str(tmp_path)).observation_keys == ()
 
 
 def test_targets_that_are_none(tmp_path):

@@ -258,3 +258,12 @@ def test_a_reward_that_is_not_known_is_said():
         task.imagined_reward
     with pytest.raises(ValueError, match=r"termination=learned, none or"):
         task.terminates
+
+
+def test_a_package_that_gymnasium_lacks_is_named(monkeypatch):
+    def lacking(*_, **__):
+        raise gymnasium.error.DependencyNotInstalled("Box2D is not installed")
+
+    monkeypatch.setattr(gymnasium, "make", lacking)
+    with pytest.raises(ValueError, match="gymnasium/Pendulum-v1: Box2D is not installed"):
+        ExternalTask(environment_source("gymnasium/Pendulum-v1"))

@@ -15,6 +15,7 @@ from omegaconf import OmegaConf
 from torchrl_l1.campaign import read_campaign
 from torchrl_l1.campaign.jobs import sweep
 from torchrl_l1.campaign.plan import plan
+from torchrl_l1.campaign.reuse import find_reusable
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.launch import compose
 
@@ -197,3 +198,58 @@ def test_only_recipes_that_name_code_have_a_search_path(place: Path) -> None:
     assert list(compose("pets/any", ["task=gymnasium/Pendulum-v1"]).search_path) == []
     assert list(compose("pets/any", ["task=rafts:Raft-v0"]).search_path) == [str(place)]
     assert list(compose("metrpo/half_cheetah").search_path) == []
+
+
+def test_offline_learning_starts_where_measured_episodes_did(place: Path) -> None:
+    rest = ["horizon=8", "fit.max_epochs=1", "fit.max_gradient_steps=3", "wandb.mode=disabled"]
+    rows_ = "x,v,u\n" + "".join(f"{0.1 * i},{0.2 * (i % 3)},{0.3 * (i % 2)}\n" for i in range(60))
+    (place / "data.csv").write_text(rows_)
+    main(
+        [
+            *("run", "offline/inverted_pendulum", "task=own.py:make_env", "reward=own.py:reward"),
+            *("termination=none", "dataset=data.csv", "columns.observation=[x,v]"),
+            *("columns.action=[u]", "imagined_from_data=0.0", "imagined_steps=100"),
+            *("imagined_horizon=5", "trpo_iterations=1", "evaluation_episodes=2"),
+            *("outer_iterations=1", "cloning.max_epochs=1", "run_dir=runs/offline", *rest),
+        ]
+    )
+    assert len(rows(place / "runs" / "offline" / "metrics.csv")) == 1
+
+
+def test_a_suite_leaves_out_what_cannot_act_and_one_run_is_no_two_seeds(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["run", "mine.yaml", *TINY, "run_dir=runs/a", "checkpoint.best=true"])
+    kept = "runs/a/checkpoints/best.pt"
+    with pytest.raises(SystemExit):
+        main(["evaluate", "runs/a", "--episodes", "1", "--payload", "0.5"])
+    assert "leave it out" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["evaluate", "runs/a", kept, "--episodes", "1"])
+    assert "are of one run" in capsys.readouterr().err
+    assert not (place / "runs" / "a" / "evaluation").exists()
+    main(["evaluate", kept, "--suite", "quick", "--episodes", "1", "--l1", "off"])
+    table = rows(place / "runs" / "a" / "evaluation_best" / "evaluation.csv")
+    assert len(table) > 3 and all(float(row["payload"]) == 0 for row in table)
+
+
+def test_runs_of_another_folders_file_are_not_reused(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = place / "other"
+    other.mkdir()
+    (other / "own.py").write_text(PACKAGE.replace("0.1 * np", "0.3 * np"))
+    overrides = ", ".join(f'"{text}"' for text in [*TINY, "reward=learned"])
+    for folder in (place, other):
+        (folder / "study.yaml").write_text(
+            f"runs:\n  - recipe: pets/any\n    overrides: [{overrides}]\n"
+            '    matrix:\n      task: ["own.py:make_env"]\n'
+        )
+    main(["campaign", "study.yaml", "--output", "study", "--workers", "1"])
+    found = []
+    for folder in (place, other):
+        monkeypatch.chdir(folder)
+        output = (folder / "again").resolve()
+        runs = plan(read_campaign("study.yaml", []), output)
+        found.append(len(find_reusable(runs, output, [place / "study"])))
+    assert found == [1, 0]

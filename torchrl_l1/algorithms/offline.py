@@ -230,8 +230,10 @@ class Offline(Algorithm):
                 self.known |= self._first_policy()
                 with self.phase("evaluate"):
                     self.acting_policy.load_state_dict(self.policy.state_dict())
-                    first = episode_returns(self.evaluation.evaluate(self.seed, iteration))
-                    self.known["clone/return"] = first.mean().item()
+                    first = self.evaluation.evaluate(self.seed, iteration)
+                    self.known["clone/return"] = episode_returns(first).mean().item()
+                    # An environment of elsewhere does not tell how its episodes start.
+                    self.improvement.see(first[:, :1])
                 # That has begun a stream of its own.
                 seed_streams(self.seed, "improvement")
 

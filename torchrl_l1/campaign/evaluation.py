@@ -7,7 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_l1.campaign.description import EvaluationSettings, dump_yaml, load_yaml
-from torchrl_l1.experiment.evaluate import distinct, episodes_file, evaluate_episodes, load_run
+from torchrl_l1.experiment.evaluate import (
+    distinct,
+    episodes_file,
+    evaluate_episodes,
+    load_run,
+    reachable,
+)
 from torchrl_l1.experiment.files import refuse_link, write_atomically, write_table
 from torchrl_l1.experiment.matrix import suite
 from torchrl_l1.experiment.run_directory import RunDirectory
@@ -73,6 +79,8 @@ def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
         refuse_link(folder)
     trained = load_run(run_dir, last=True)
     cells = distinct(trained, chosen.conditions())
+    if chosen.suite is not None:
+        cells = reachable(trained.algorithm.task, cells)
     rows, episodes = [], []
     for row, single in evaluate_episodes(trained, cells, chosen.episodes, chosen.seed):
         rows.append(row)

@@ -100,8 +100,10 @@ def _left(folder: str, names: list[str]) -> set[str]:
 
 
 def _key(config: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Differs only between runs that :func:`differences` tells apart, and is quicker."""
-    return tuple(str(config.get(key)) for key in ("task", "seed", "outer_iterations"))
+    """Differs between runs that :func:`differences` tells apart, and where their code is from."""
+    # Files and modules of one name in different folders are not the same.
+    folders = tuple(map(str, config.get("search_path") or ()))
+    return *(str(config.get(key)) for key in ("task", "seed", "outer_iterations")), folders
 
 
 def _finished(directory: RunDirectory, config: Mapping[str, Any]) -> bool:

@@ -22,10 +22,12 @@ from torchrl_l1.envs.rendering import (
 from torchrl_l1.experiment.checkpoints import CheckpointSettings
 from torchrl_l1.experiment.evaluate import (
     TrainedRun,
+    check_plants,
     distinct,
     evaluate_episodes,
     load_run,
     make_collection,
+    reachable,
 )
 from torchrl_l1.experiment.files import refuse_link, write_table
 from torchrl_l1.experiment.l1_options import check_tested
@@ -175,6 +177,13 @@ def _check_one_study(runs: Sequence[TrainedRun]) -> None:
             checkpoint=CheckpointSettings(),
         )
 
+    for number, trained in enumerate(runs):
+        for other in runs[:number]:
+            if other.path.resolve() == trained.path.resolve():
+                raise ValueError(
+                    f"{other.name} and {trained.name} are of one run, no two seeds; evaluate them "
+                    "one at a time"
+                )
     for trained in runs[1:]:
         if settings(trained) != settings(runs[0]):
             raise ValueError(
@@ -237,6 +246,9 @@ def evaluate_command(options: argparse.Namespace) -> None:
     _check_one_study(runs)
     values["stage"] = _stages(runs, options.stage)
     cells = distinct(runs[0], conditions(options.suite, **values))
+    if options.suite:  # of which none can be left out by hand
+        cells = reachable(runs[0].algorithm.task, cells)
+    check_plants(runs[0].algorithm.task, cells)
     # A kept checkpoint has a folder of its own: its results are not the run's.
     folder = "_".join(filter(None, ["evaluation", runs[0].checkpoint]))
     output = Path(options.output) if options.output else runs[0].path / folder

@@ -25,7 +25,7 @@ from torchrl_l1.atomic import write_atomically, write_through
 from torchrl_l1.control import L1Transform
 from torchrl_l1.deployment.learning import policy_transforms
 from torchrl_l1.deployment.robust_controller import RobustController
-from torchrl_l1.envs.references import require
+from torchrl_l1.envs.references import making, require
 from torchrl_l1.envs.rendering import draw_poses, rollout_frames, write_gif
 from torchrl_l1.envs.sources import simulation_of
 from torchrl_l1.experiment.l1_options import OFF
@@ -97,7 +97,8 @@ def film(
     with torch.random.fork_rng(devices=[]), torch.no_grad():
         env.set_seed(stream_seed(seed, "play") % 2**31)
         seed_streams(seed, "play")
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
+        # Gymnasium asks for the package that draws as late as it draws.
+        with set_exploration_type(ExplorationType.DETERMINISTIC), making(source.name):
             data = env.rollout(steps, robust.policy, callback=record)
     record()  # the last step, after which nothing is called
     ended = bool(data["next", "terminated"].any())

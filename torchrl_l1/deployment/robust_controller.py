@@ -37,6 +37,7 @@ from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.files import read_text
 from torchrl_l1.experiment.l1_options import OFF, closest_option, l1_option
+from torchrl_l1.experiment.run_directory import RunDirectory, read_config
 from torchrl_l1.experiment.settings import l1_config
 
 PRESETS = ("robust", "paper")
@@ -207,7 +208,6 @@ class RobustController:
         for what, value in (("make_env", make_env), ("policy", policy)):
             if value is None and not stored["environment" if what == "make_env" else what]:
                 raise ValueError(f"{folder} names no {what}, which was an object: give it again")
-        source = environment_source(stored["environment"] if make_env is None else make_env)
         names = {key: stored.get(key) for key in ("policy", "normalization", "weights")}
         if policy is None:
             found = {key: _placed(value, folder) for key, value in names.items()}
@@ -215,6 +215,7 @@ class RobustController:
         else:
             given = {"normalization": None, "weights": None}
         assert policy is not None
+        source = _source(stored["environment"] if make_env is None else make_env, policy)
         return cls(
             source,
             load_policy(policy, source.one(), **given),
@@ -223,6 +224,19 @@ class RobustController:
             stored["preset"],
             {"policy": policy if isinstance(policy, str) else None, **given},
         )
+
+
+def _source(make_env: MakeEnv, policy: Policy) -> EnvironmentSource:
+    """The environment, with the parts of its observation in the order of a run's policy."""
+    run = Path(policy) if isinstance(policy, str) else None
+    config = None if run is None else RunDirectory(kept_by(run) or run).config_file
+    if config is None or not config.is_file():
+        return environment_source(make_env)
+    settings = read_config(config)
+    if make_env != settings.get("task"):
+        return environment_source(make_env)
+    source = environment_source(make_env, settings.get("search_path") or ())
+    return replace(source, observation_keys=tuple(settings.get("observation_keys") or ()))
 
 
 def _copied(file: Path, folder: Path, role: str) -> str:
@@ -337,7 +351,7 @@ def robustify(
     check_not_negative("noise", noise)
     if dt is not None:
         check_positive("dt", dt)
-    source = environment_source(make_env)
+    source = _source(make_env, policy)
     dt = source.time_step() if dt is None else dt
     if dt is None:
         raise ValueError(
@@ -438,7 +452,7 @@ def load_target(
             f"there is no folder {target}; give a controller, a run directory, or an environment "
             "with --policy"
         )
-    source = environment_source(target)
+    source = _source(target, policy)
     acting = load_policy(policy, source.one(), normalization, weights)
     return RobustController(source, acting, EnsembleDynamics(1, 1, hidden=()), {}, OFF)
 

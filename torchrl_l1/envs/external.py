@@ -19,6 +19,7 @@ from torchrl_l1.envs.cells import PAGE, Cell, GymnasiumCell, TorchRLCell
 from torchrl_l1.envs.known_rewards import Outcome
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
 from torchrl_l1.envs.plant import disturbed_model
+from torchrl_l1.envs.references import making
 from torchrl_l1.envs.sources import EnvironmentSource, environment_source
 from torchrl_l1.envs.task import RewardFn, Scalars, Task
 
@@ -92,7 +93,8 @@ class ExternalTask:
         """
         if self.source.gymnasium_id:
             options: dict[str, Any] = {} if limited else {"max_episode_steps": -1}
-            made = gymnasium.make(self.source.gymnasium_id, disable_env_checker=True, **options)
+            with making(self.name):
+                made = gymnasium.make(self.source.gymnasium_id, disable_env_checker=True, **options)
             return GymnasiumCell(made, self.name, self._keys)
         env = self.source.build()
         plain = type(env) in (GymEnv, GymWrapper) and getattr(env, "wrapper_frame_skip", 1) == 1

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from importlib import import_module, invalidate_caches
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+
+import gymnasium
 
 
 def require(module: str, extra: str) -> ModuleType:
@@ -24,6 +27,19 @@ def require(module: str, extra: str) -> ModuleType:
         raise ValueError(
             f"{module} cannot be imported ({error}): pip install 'torchrl-l1[{extra}]'"
         ) from None
+
+
+@contextmanager
+def making(name: str) -> Iterator[None]:
+    """Say in a line that a package is missing, without which Gymnasium makes no environment.
+
+    Raises:
+        ValueError: with the name of the environment and what Gymnasium says.
+    """
+    try:
+        yield
+    except (gymnasium.error.Error, ImportError) as error:
+        raise ValueError(f"{name}: {' '.join(str(error).split())}") from error
 
 
 def load_attribute(name: str, search_path: Sequence[str | Path] = ()) -> Any:

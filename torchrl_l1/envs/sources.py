@@ -31,7 +31,7 @@ from torchrl_l1.envs.factory import disturbance_transforms, make_env
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
 from torchrl_l1.envs.perturbations import DISTURBANCES, Disturbance
 from torchrl_l1.envs.plant import disturbed_model
-from torchrl_l1.envs.references import find_attribute, load_module, require
+from torchrl_l1.envs.references import find_attribute, load_module, making, require
 from torchrl_l1.envs.task import Task
 from torchrl_l1.envs.tasks import TASKS
 
@@ -250,7 +250,12 @@ def _of_gymnasium(
         gymnasium.spec(plain)
     except (gymnasium.error.Error, ValueError) as error:
         raise ValueError(f"{name}: {error}; names are {FORMS}") from None
-    return EnvironmentSource(name, partial(GymEnv, plain), gymnasium_id=plain)
+    return EnvironmentSource(name, partial(_gym_env, name, plain), gymnasium_id=plain)
+
+
+def _gym_env(name: str, plain: str, **options: Any) -> EnvBase:
+    with making(name):
+        return GymEnv(plain, **options)
 
 
 def _of_dm_control(name: str, rest: str) -> EnvironmentSource:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -231,6 +232,16 @@ def check_plants(task: AnyTask, cells: Sequence[Condition]) -> None:
     for cell in cells:
         changed = disturbed(cell.disturbances)
         task.check_disturbances([n for n in changed if DISTURBANCES[n].acts_on == "plant"])
+
+
+def reachable(task: AnyTask, cells: Sequence[Condition]) -> list[Condition]:
+    """Those conditions of a suite that can act on a task."""
+    found = []
+    for cell in cells:
+        with suppress(ValueError):
+            check_plants(task, [cell])
+            found.append(cell)
+    return found
 
 
 def episodes_file(table: Path) -> Path:
