@@ -86,7 +86,7 @@ def draw() -> None:
         print(f"L1 {name}: {half[0]:.0f} MiB at half of the steps, {half[-1]:.0f} MiB at the end")
     ax.set_xlabel(f"steps of {ENVIRONMENTS} environments")
     ax.set_ylabel("resident set, MiB")
-    ax.set_ylim(bottom=0)
+    ax.set_ylim(0, 1.15 * max(float(row["mebibytes"]) for row in rows))
     ax.legend(loc="lower right")
     figure.savefig(HERE / "memory.png", dpi=110)
     print(f"Figure: {HERE / 'memory.png'}")
