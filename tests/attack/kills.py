@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import os
 import random
 import signal
@@ -126,8 +127,13 @@ def torn(folder: Path, whole: Unbroken) -> str | None:
     for path, _ in run_directories(folder):
         name = str((path / "metrics.csv").relative_to(folder))
         if (path / "metrics.csv").exists():
-            content = (path / "metrics.csv").read_bytes()
-            if not whole.results[name].startswith(content):
+            found, complete = (
+                list(csv.DictReader(io.StringIO(text.decode(), newline="")))
+                for text in ((path / "metrics.csv").read_bytes(), whole.results[name])
+            )
+            # Columns of later stages are not there yet.
+            begun = [{key: row[key] for key in found[0]} for row in complete if found]
+            if found != begun[: len(found)]:
                 return f"{name} is no part of the unbroken one"
     return None
 

@@ -41,7 +41,13 @@ def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> N
     ours = [text for text in overrides if text not in for_hydra]
     campaign = read_campaign(options.campaign, ours, trusted=options.trust)
     for_hydra += ["--trust"] if options.trust else []
-    output = Path(options.output or f"runs/campaigns/{campaign.name}").resolve()
+    output = Path(options.output or f"runs/campaigns/{campaign.name}")
+    try:
+        output = output.resolve()
+    except RuntimeError as error:  # OSError from Python 3.13 on
+        raise OSError(
+            f"{output} leads to itself through symbolic links: choose a folder"
+        ) from error
     _check_owner(output, campaign)
     # Runs that are reused need no device, so devices are checked once these are known.
     runs = plan(campaign, output, trusted=options.trust)
