@@ -101,6 +101,16 @@ def test_weights_that_are_pickles_of_objects_are_refused(env, policy_file, tmp_p
         load_policy(f"{policy_file}:network", env, weights=str(tmp_path / "module.pt"))
 
 
+@pytest.mark.parametrize(
+    "content", [b"", b"root:x:0:0:root:/root:/bin/bash\n", b"\x80\x02t.", b"["]
+)
+def test_weights_that_are_something_else_are_refused(env, policy_file, tmp_path, content):
+    file = tmp_path / "weights.pt"
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match=r"weights\.pt is no state dict"):
+        load_policy(f"{policy_file}:network", env, weights=str(file))
+
+
 def test_torchrl_modules_are_taken_as_they_are(env):
     module = TensorDictModule(balance, ["observation"], ["action"])
     assert load_policy(module, env) is module

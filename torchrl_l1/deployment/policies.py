@@ -274,7 +274,8 @@ def load_policy(
                 f"{weights} is no state dict, or holds more than its tensors, and loading that "
                 "would execute what is in it: save module.state_dict()"
             ) from None
-        except (EOFError, RuntimeError) as error:
+        except (EOFError, RuntimeError, LookupError, TypeError, AttributeError) as error:
+            # What is read as a pickle and is none may end in any of these.
             raise ValueError(f"{weights} is no state dict: {_short(error)}") from error
         try:
             found.load_state_dict(stored)
