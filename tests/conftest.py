@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
@@ -60,17 +61,12 @@ class Process(Protocol):
     def kill(self) -> None: ...
 
 
-class Forked:
-    """A process of the command line, forked from one that has loaded the package."""
+class Started:
+    """A process of Python's own kind, started."""
 
-    def __init__(self, arguments: Sequence[str], output: Path) -> None:
-        request = ("torchrl_l1.cli", list(arguments), str(output))
-        self._process = multiprocessing.get_context("forkserver").Process(
-            target=runpy.run_path,
-            args=(str(FORKED),),
-            kwargs={"init_globals": {"REQUEST": request}, "run_name": "__main__"},
-        )
-        self._process.start()
+    def __init__(self, process: multiprocessing.process.BaseProcess) -> None:
+        self._process = process
+        process.start()
 
     @property
     def pid(self) -> int:
@@ -83,11 +79,26 @@ class Forked:
     def wait(self, timeout: float | None = None) -> int:
         self._process.join(timeout)
         if self._process.exitcode is None:
-            raise subprocess.TimeoutExpired(str(FORKED), timeout or 0.0)
+            raise subprocess.TimeoutExpired("torchrl-l1", timeout or 0.0)
         return self._process.exitcode
 
     def kill(self) -> None:
-        os.kill(self.pid, signal.SIGKILL)
+        with suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGKILL)
+
+
+class Forked(Started):
+    """A process of the command line, forked from one that has loaded the package."""
+
+    def __init__(self, arguments: Sequence[str], output: Path) -> None:
+        request = ("torchrl_l1.cli", list(arguments), str(output))
+        super().__init__(
+            multiprocessing.get_context("forkserver").Process(
+                target=runpy.run_path,
+                args=(str(FORKED),),
+                kwargs={"init_globals": {"REQUEST": request}, "run_name": "__main__"},
+            )
+        )
 
 
 def started_anew(arguments: Sequence[str], output: Path) -> subprocess.Popen[bytes]:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from tests.attack.outcome import Attack, Command, Row, Said, command
 from tests.conftest import TINY
+from tests.kills import MBMF
 from torchrl_l1.campaign.description import dump_yaml
 from torchrl_l1.experiment.run_directory import RunDirectory, run_directories
 
@@ -25,13 +26,7 @@ PETS_TINY = [
     *("model.members=2", "model.hidden=[8]", "fit.batch_size=16", "fit.max_epochs=20"),
     "wandb.mode=disabled",
 ]
-MBMF_TINY = [
-    *("outer_iterations=6", "shooting_iterations=2", "cloning.iterations=2", "horizon=10"),
-    *("shooting_episodes=2", "fine_tuning.episodes=2", "fine_tuning.minibatches=2"),
-    *("evaluation_episodes=2", "shooting.candidates=16", "shooting.horizon=4"),
-    *("model.hidden=[8]", "fit.max_epochs=20", "cloning.max_epochs=20"),
-    *("fine_tuning.epochs=20", "wandb.mode=disabled"),
-]
+MBMF_TINY = [*MBMF, "wandb.mode=disabled"]
 RUNS = {
     "METRPO": ("metrpo/inverted_pendulum", METRPO_TINY),
     "PETS": ("pets/inverted_pendulum", PETS_TINY),

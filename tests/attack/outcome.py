@@ -8,12 +8,11 @@ import random
 import re
 import subprocess
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from tests import forked
-from tests.conftest import HAS_FORKS, PRELOADED, Process, started_anew
+from tests.conftest import HAS_FORKS, PRELOADED, Process, Started, started_anew
 
 SECONDS = 300
 """After which a command counts as hanging."""
@@ -100,7 +99,7 @@ class Command(Process):
         if HAS_FORKS:
             context = multiprocessing.get_context("forkserver")
             context.set_forkserver_preload([*PRELOADED, "tests.attack.outcome"])
-            self._process = _Forked(
+            self._process = Started(
                 context.Process(target=_run, args=(self.arguments, str(output), prepare))
             )
         else:
@@ -129,30 +128,6 @@ class Command(Process):
             self.wait()
             status = None
         return Said(self.arguments, status, self.output.read_text(errors="replace"))
-
-
-class _Forked(Process):
-    def __init__(self, process: multiprocessing.process.BaseProcess) -> None:
-        self._process = process
-        process.start()
-
-    @property
-    def pid(self) -> int:
-        assert self._process.pid is not None
-        return self._process.pid
-
-    def poll(self) -> int | None:
-        return self._process.exitcode
-
-    def wait(self, timeout: float | None = None) -> int:
-        self._process.join(timeout)
-        if self._process.exitcode is None:
-            raise subprocess.TimeoutExpired("torchrl-l1", timeout or 0.0)
-        return self._process.exitcode
-
-    def kill(self) -> None:
-        with suppress(ProcessLookupError):
-            os.kill(self.pid, 9)
 
 
 def _run(arguments: list[str], output: str, prepare: Callable[[], object] | None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from torchrl_l1.algorithms.config import ModelConfig
 from torchrl_l1.checks import (
@@ -107,23 +108,49 @@ class METRPOConfig:
     precision: str = "float32"
 
     def __post_init__(self) -> None:
-        resolve_precision(self.precision)
-        check_choice("label", self.label, ("nominal", "executed"))
-        check_choice("box_exit", self.box_exit, ("truncate", "fail"))
+        check_improvement(self)
         check_optional_count("episode_steps", self.episode_steps)
-        counts = ("outer_iterations", "episodes_per_iteration", "evaluation_episodes")
-        check_counts(self, *counts, "trpo_iterations", "imagined_horizon")
-        if not self.imagined_steps >= self.imagined_horizon:
-            raise ValueError(
-                f"imagined_steps ({self.imagined_steps}) must hold at least one trajectory of "
-                f"imagined_horizon ({self.imagined_horizon}) steps"
-            )
-        for name in ("imagined_from_data", "discount", "gae_lambda"):
-            check_within(name, getattr(self, name), "[0, 1]")
+        check_counts(self, "outer_iterations", "episodes_per_iteration", "evaluation_episodes")
 
     def collected_episodes(self, iterations: int) -> int:
         """Real episodes of so many outer iterations; random data do not count."""
         return iterations * self.episodes_per_iteration
+
+
+class ImprovementConfig(Protocol):
+    """Settings of the policy's improvement in imagination, see :class:`METRPOConfig`."""
+
+    label: str
+    trpo_iterations: int
+    imagined_steps: int
+    imagined_horizon: int
+    imagined_from_data: float
+    imagined_termination: bool
+    box_exit: str
+    bootstrap: bool
+    discount: float
+    gae_lambda: float
+    trpo: TRPOConfig
+    precision: str
+
+
+def check_improvement(settings: ImprovementConfig) -> None:
+    """Refuse what no policy can be improved with in imagination.
+
+    Raises:
+        ValueError: naming the setting.
+    """
+    resolve_precision(settings.precision)
+    check_choice("label", settings.label, ("nominal", "executed"))
+    check_choice("box_exit", settings.box_exit, ("truncate", "fail"))
+    check_counts(settings, "trpo_iterations", "imagined_horizon")
+    if not settings.imagined_steps >= settings.imagined_horizon:
+        raise ValueError(
+            f"imagined_steps ({settings.imagined_steps}) must hold at least one trajectory of "
+            f"imagined_horizon ({settings.imagined_horizon}) steps"
+        )
+    for name in ("imagined_from_data", "discount", "gae_lambda"):
+        check_within(name, getattr(settings, name), "[0, 1]")
 
 
 def check_clipping(clip_actions: bool, with_l1: bool) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from torchrl_l1.algorithms.config import ModelConfig
-from torchrl_l1.algorithms.metrpo_config import PolicyConfig
+from torchrl_l1.algorithms.metrpo_config import PolicyConfig, check_improvement
 from torchrl_l1.checks import (
     check_choice,
     check_counts,
@@ -15,7 +15,6 @@ from torchrl_l1.checks import (
 )
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.objectives import TRPOConfig
-from torchrl_l1.planning import resolve_precision
 
 PENALTIES = ("mopo", "morel", "none")
 """What is done about a model that does not know, see :class:`OfflineConfig`."""
@@ -138,22 +137,12 @@ class OfflineConfig:
     precision: str = "float32"
 
     def __post_init__(self) -> None:
-        resolve_precision(self.precision)
-        check_choice("label", self.label, ("nominal", "executed"))
+        check_improvement(self)
         check_choice("penalty", self.penalty, PENALTIES)
         check_choice("uncertainty", self.uncertainty, MEASURES)
-        check_choice("box_exit", self.box_exit, ("truncate", "fail"))
         check_not_negative("penalty_coefficient", self.penalty_coefficient)
         check_not_negative("halt_deviations", self.halt_deviations)
-        counts = ("outer_iterations", "evaluation_episodes", "trpo_iterations", "imagined_horizon")
-        check_counts(self, *counts)
-        if not self.imagined_steps >= self.imagined_horizon:
-            raise ValueError(
-                f"imagined_steps ({self.imagined_steps}) must hold at least one trajectory of "
-                f"imagined_horizon ({self.imagined_horizon}) steps"
-            )
-        for name in ("imagined_from_data", "discount", "gae_lambda"):
-            check_within(name, getattr(self, name), "[0, 1]")
+        check_counts(self, "outer_iterations", "evaluation_episodes")
         if self.uncertainty == "deviation" and self.model.head != "gaussian":
             raise ValueError(
                 "uncertainty=deviation needs members that predict a distribution: set "

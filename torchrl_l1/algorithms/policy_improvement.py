@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import fmean
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -14,13 +14,13 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
+from torchrl_l1.algorithms.metrpo_config import ImprovementConfig
 from torchrl_l1.algorithms.outcomes import Outcomes
 from torchrl_l1.algorithms.policy import GaussianPolicy, make_actor
 from torchrl_l1.dynamics import EnsembleDynamics, imagine
 from torchrl_l1.envs import AnyTask, StartStates, Task, action_bounds
 from torchrl_l1.objectives import (
     LinearFeatureBaseline,
-    TRPOConfig,
     TRPOReport,
     gaussian_trpo_step,
     trpo_step,
@@ -36,21 +36,6 @@ POLICY_METRICS: dict[str, str] = {
     "trpo/accepted": "Share of TRPO steps whose line search succeeded.",
 }
 """What the policy's improvement reports: all TRPO steps of an outer iteration."""
-
-
-class ImprovementConfig(Protocol):
-    """Settings of the improvement, see :class:`~torchrl_l1.algorithms.METRPOConfig`."""
-
-    imagined_steps: int
-    imagined_horizon: int
-    imagined_from_data: float
-    imagined_termination: bool
-    box_exit: str
-    bootstrap: bool
-    discount: float
-    gae_lambda: float
-    trpo: TRPOConfig
-    precision: str
 
 
 @dataclass
