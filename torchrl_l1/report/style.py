@@ -147,7 +147,8 @@ def fit_scale(axes: Sequence[Axes], values: Iterable[np.ndarray | Sequence[float
         ticks = [0.0] + [-(10.0**k) for k in range(-1, 7) if 10.0**k < -3 * every.min()]
         for axis in axes:
             axis.set_yscale("symlog", linthresh=0.1, linscale=0.5)
-            axis.set_yticks(ticks)
+            # In plain text: formulas are off, since names come from files.
+            axis.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
             # The margins would otherwise be those of the linear scale.
             axis.set_ylim(1.6 * every.min(), 0.03)
 
