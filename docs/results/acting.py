@@ -3,12 +3,15 @@
     python docs/results/acting.py RUN [RUN ...]
 
 Every rule gets the same posterior mean d and standard deviation s of the disturbance, from the same
-Kalman filter, and says what the input cancels. Writes `acting.csv` and `acting.md` beside this
-file: returns of 16 episodes of the policy's mean action, paired by their resets with L1 off.
+Kalman filter, and says what the input cancels. Keeps the returns of 16 episodes of the policy's
+mean action, paired by their resets with L1 off, in `acting.csv` beside this file, in place of those
+of the same policies, and writes from all of them `acting.md`, the change of the return, and
+`acting_recovered.md`, the shares of what the oracle gets back of a bias.
 """
 
 from __future__ import annotations
 
+import csv
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -32,9 +35,12 @@ CONDITIONS: dict[str, dict[str, Any]] = {
     "action noise": {"noise": "action"},
     "observation noise": {"noise": "observation"},
     "bias 0.2": {"disturbances": {"bias": 0.2}},
+    "bias 0.4": {"disturbances": {"bias": 0.4}},
     "bias -0.4": {"disturbances": {"bias": -0.4}},
     "step 0.2": {"disturbances": {"step": 0.2}},
 }
+RECOVERED = ("everything (z = 0)", "dead zone, z = 1", "dead zone, z = 2", "dead zone, z = 3")
+Row = dict[str, Any]
 Rule = Callable[[kalman.Posterior], Tensor]
 shipped = kalman.significant
 
@@ -76,19 +82,22 @@ def rules(trained: TrainedRun) -> dict[str, Rule]:
     }
 
 
-def compare(trained: TrainedRun) -> list[dict[str, Any]]:
+def compare(trained: TrainedRun) -> list[Row]:
     """One row per rule and condition of a run."""
     rows = []
     for name, test in CONDITIONS.items():
         cell = {"policy": "deterministic", **test}
         off = _returns(trained, Condition("off", **cell))
         rows.append(_row(trained, name, "off", off, off))
+        if "disturbances" in test:
+            oracle = _returns(trained, Condition("oracle", **cell))
+            rows.append(_row(trained, name, "oracle", oracle, off))
         for rule, function in rules(trained).items():
             kalman.significant = lambda posterior, dead_zone, f=function: f(posterior)
-            rows.append(
-                _row(trained, name, rule, _returns(trained, Condition("robust", **cell)), off)
-            )
-        print(trained.path, name, [round(row["return"]) for row in rows[-8:]], flush=True)
+            robust = _returns(trained, Condition("robust", **cell))
+            rows.append(_row(trained, name, rule, robust, off))
+        returns = [round(row["return"]) for row in rows if row["condition"] == name]
+        print(trained.path, name, returns, flush=True)
     return rows
 
 
@@ -96,9 +105,7 @@ def _returns(trained: TrainedRun, cell: Condition) -> np.ndarray:
     return episode_returns(make_collection(trained, cell, EPISODES).evaluate(SEED)).numpy()
 
 
-def _row(
-    trained: TrainedRun, name: str, rule: str, returns: np.ndarray, off: np.ndarray
-) -> dict[str, Any]:
+def _row(trained: TrainedRun, name: str, rule: str, returns: np.ndarray, off: np.ndarray) -> Row:
     difference = returns - off
     return {
         "task": trained.recipe.task,
@@ -111,42 +118,70 @@ def _row(
     }
 
 
-def lines(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def lines(rows: Sequence[Row]) -> list[Row]:
     """A row per rule, a column per condition: mean over runs of the change, in % of undisturbed."""
     found = []
-    undisturbed = {
-        (row["task"], row["seed"]): row["return"]
-        for row in rows
-        if (row["condition"], row["rule"]) == ("undisturbed", "off")
-    }
-    for rule in dict.fromkeys(row["rule"] for row in rows if row["rule"] != "off"):
-        line: dict[str, Any] = {"rule": rule}
+    for rule in dict.fromkeys(row["rule"] for row in rows if row["rule"] not in ("off", "oracle")):
+        line: Row = {"rule": rule}
         for name in CONDITIONS:
             changes = [
-                100 * row["difference"] / abs(undisturbed[row["task"], row["seed"]])
-                for row in rows
-                if (row["rule"], row["condition"]) == (rule, name)
+                100 * difference / abs(_value(rows, policy, "undisturbed", "off", "return"))
+                for policy in _policies(rows)
+                if (difference := _value(rows, policy, name, rule)) is not None
             ]
-            line[name] = f"{np.mean(changes):+.1f} ({min(changes):+.1f})"
+            line[name] = f"{np.mean(changes):+.1f} ({min(changes):+.1f})" if changes else "–"
         found.append(line)
     return found
 
 
+def recovered(rows: Sequence[Row]) -> list[Row]:
+    """A row per policy and costly bias: the share of the oracle's gain that each rule gets back."""
+    found = []
+    for policy in _policies(rows):
+        for name in ("bias 0.2", "bias 0.4", "bias -0.4"):
+            gain = _value(rows, policy, name, "oracle")
+            error = _value(rows, policy, name, "oracle", "standard_error")
+            if gain is None or gain < 2 * error:
+                continue
+            line: Row = {"task": policy[0], "seed": policy[1], "disturbance": name}
+            line["oracle"] = f"{gain:+.4g}"
+            for rule in RECOVERED:
+                line[rule] = f"{_value(rows, policy, name, rule) / gain:.2f}"
+            found.append(line)
+    return found
+
+
+def _policies(rows: Sequence[Row]) -> list[tuple[str, str]]:
+    return sorted({(row["task"], str(row["seed"])) for row in rows})
+
+
+def _value(
+    rows: Sequence[Row], policy: tuple[str, str], name: str, rule: str, of: str = "difference"
+) -> Any:
+    for row in rows:
+        if (row["task"], str(row["seed"]), row["condition"], row["rule"]) == (*policy, name, rule):
+            return float(row[of])
+    return None
+
+
 def main(runs: Sequence[str]) -> None:
     """All of it."""
-    rows = [row for run in runs for row in compare(load_run(run))]
-    write_table(HERE / "acting.csv", rows)
-    policies = sorted({f"{row['task']} (seed {row['seed']})" for row in rows})
+    kept = HERE / "acting.csv"
+    rows: list[Row] = [row for run in runs for row in compare(load_run(run))]
+    with kept.open(newline="") as handle:
+        old = [r for r in csv.DictReader(handle) if (r["task"], r["seed"]) not in _policies(rows)]
+    rows = sorted([*old, *rows], key=lambda row: (row["task"], str(row["seed"])))
+    write_table(kept, rows)
+    policies = [f"{task} (seed {seed})" for task, seed in _policies(rows)]
     note = (
         "Change of the return against L1 off, in % of the undisturbed return without L1: mean over "
         f"the policies {', '.join(policies)}, in brackets the worst of them; {EPISODES} episodes "
         "each."
     )
     (HERE / "acting.md").write_text(f"{markdown(lines(rows))}\n\n{note}\n")
-    print(f"Table: {HERE / 'acting.md'}")
+    (HERE / "acting_recovered.md").write_text(markdown(recovered(rows)) + "\n")
+    print(f"Tables: {HERE / 'acting.md'}, {HERE / 'acting_recovered.md'}")
 
 
 if __name__ == "__main__":
-    if len(sys.argv) < 2:
-        sys.exit(__doc__)
     main(sys.argv[1:])

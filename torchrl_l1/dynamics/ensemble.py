@@ -38,39 +38,51 @@ class Activation(NamedTuple):
         value_and_derivative: it and its derivative.
         in_place: it, written over what it is applied to. At the sizes of planning a fresh tensor
             costs as much as the activation.
+        into: it, written into the second tensor.
         one: what it maps to one, in bfloat16 too.
-        backward: the gradient by what it was applied to, from the gradient by what came of it,
-            the former and the latter.
+        backward: the gradient by what it was applied to, written over the gradient by what came
+            of it, from that, the former and the latter.
     """
 
     value: Callable[[Tensor], Tensor]
     value_and_derivative: Callable[[Tensor], tuple[Tensor, Tensor]]
     in_place: Callable[[Tensor], Tensor]
+    into: Callable[[Tensor, Tensor], Tensor]
     one: float
     backward: Callable[[Tensor, Tensor, Tensor], Tensor]
 
+
+ALIGNMENT = 16
+"""Widths of hidden layers are filled up to multiples of this, where they are filled up."""
 
 ACTIVATIONS: dict[str, Activation] = {
     "relu": Activation(
         torch.relu,
         _relu,
         torch.relu_,
+        lambda z, out: torch.clamp_min(z, 0, out=out),
         one=1.0,
-        backward=lambda g, z, units: torch.ops.aten.threshold_backward(g, units, 0),
+        backward=lambda g, z, units: torch.ops.aten.threshold_backward.grad_input(
+            g, z, 0, grad_input=g
+        ),
     ),
     "tanh": Activation(
         torch.tanh,
         _tanh,
         torch.tanh_,
+        lambda z, out: torch.tanh(z, out=out),
         one=20.0,
-        backward=lambda g, z, units: torch.ops.aten.tanh_backward(g, units),
+        backward=lambda g, z, units: torch.ops.aten.tanh_backward.grad_input(
+            g, units.to(g.dtype), grad_input=g
+        ),
     ),
     "silu": Activation(
         nn.functional.silu,
         _silu,
         lambda z: nn.functional.silu(z, inplace=True),
+        lambda z, out: torch.ops.aten.silu.out(z, out=out),
         one=1.2784645,
-        backward=lambda g, z, units: torch.ops.aten.silu_backward(g, z),
+        backward=lambda g, z, units: torch.ops.aten.silu_backward.grad_input(g, z, grad_input=g),
     ),
 }
 """Those that hidden layers may have."""

@@ -15,16 +15,12 @@ import torch
 from torch import Tensor
 
 from torchrl_l1.dynamics.control_affine import affine_coefficients, affine_output
-from torchrl_l1.dynamics.ensemble import ACTIVATIONS
+from torchrl_l1.dynamics.ensemble import ACTIVATIONS, ALIGNMENT
 from torchrl_l1.dynamics.heads import DeterministicHead
 from torchrl_l1.dynamics.model import EnsembleDynamics
 from torchrl_l1.dynamics.training_step import Members
 
 Precision = Literal["auto", "float32", "bfloat16"]
-
-# Widths of hidden layers are filled up to multiples of this.
-_ALIGNMENT = 16
-
 
 # Narrower products cost more to convert and to call than they save.
 _LEAST_WIDTH = 192
@@ -312,7 +308,7 @@ def _fold_biases(weights: list[Tensor], biases: list[Tensor], one: float) -> Non
     for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         members, before, after = weight.shape
         rows = before if layer == 0 else weights[layer - 1].shape[2]
-        columns = after if layer == last else -(-(after + 1) // _ALIGNMENT) * _ALIGNMENT
+        columns = after if layer == last else -(-(after + 1) // ALIGNMENT) * ALIGNMENT
         filled = weight.new_zeros(members, rows, columns)
         filled[:, :before, :after] = weight
         constant = weight.new_zeros(members, columns)

@@ -7,7 +7,7 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
-from torchrl_l1.dynamics.ensemble import ACTIVATIONS, EnsembleMLP
+from torchrl_l1.dynamics.ensemble import ACTIVATIONS, ALIGNMENT, Activation, EnsembleMLP
 from torchrl_l1.dynamics.heads import Head
 
 
@@ -42,8 +42,8 @@ class TrainingStep:
     and the decay: see ``test_the_objective_is_that_of_the_loss`` in ``test_training_step.py``.
     The network's derivatives are written out here, those of the head are its own business. In
     ``bfloat16`` the products between hidden layers and from the last one, forward and back, and
-    what is between them are of that precision; parameters, gradients, sums over a batch, the
-    input layer, and what the head sees stay float32.
+    what is between them are of that precision; parameters, their gradients, the input layer, and
+    what the head sees stay float32.
 
     Args:
         model: the ensemble. Its parameters keep the gradients in ``grad``, always in the same
@@ -69,16 +69,12 @@ class TrainingStep:
     ) -> None:
         network = model.network
         self.model, self.decay = model, decay or []
-        self._activation = ACTIVATIONS[network.activation]
-        self._weights = [weight.detach() for weight in network.weights]
-        self._biases = [bias.detach() for bias in network.biases]
-        full = self._weights[0].dtype
-        low = torch.bfloat16 if precision == "bfloat16" else full
-        self._dtypes = [full] + [low] * (len(self._weights) - 1)
         for parameter in network.parameters():
             parameter.grad = torch.zeros_like(parameter) if parameter.requires_grad else None
-        self._by_weights = [_gradient(weight) for weight in network.weights]
-        self._by_biases = [_gradient(bias) for bias in network.biases]
+        activation = ACTIVATIONS[network.activation]
+        hidden = _LowLayer if precision == "bfloat16" else _Layer
+        first, *others = zip(network.weights, network.biases, strict=True)
+        self._layers = [_Layer(*first), *(hidden(*other, activation) for other in others)]
 
     @torch.no_grad()
     def __call__(self, inputs: Tensor, target: Tensor) -> Tensor:
@@ -91,33 +87,14 @@ class TrainingStep:
         Returns:
             the members' losses ``(E,)``, without penalties.
         """
-        weights = [w.to(dtype) for w, dtype in zip(self._weights, self._dtypes, strict=True)]
-        operands, sums = [self.model.network_inputs(inputs)], []
-        last = len(weights) - 1
-        for layer, (weight, bias) in enumerate(zip(weights, self._biases, strict=True)):
-            z = torch.bmm(operands[layer], weight)
-            if layer == last:
-                z = z.to(bias.dtype)
-            sums.append(z.add_(bias.to(z.dtype)))
-            if layer < last:
-                operands.append(self._activation.value(z).to(self._dtypes[layer + 1]))
-        losses, gradient = self._head(sums.pop(), inputs, target)
-        for layer in range(last, -1, -1):
-            by_weight = self._by_weights[layer]
-            torch.sum(gradient, 1, True, dtype=by_weight.dtype, out=self._by_biases[layer])
-            gradient = gradient.to(self._dtypes[layer])
-            if gradient.dtype == by_weight.dtype:
-                torch.bmm(operands[layer].mT, gradient, out=by_weight)
-            else:
-                by_weight.copy_(torch.bmm(operands[layer].mT, gradient))
-            if layer:
-                z, units = sums[layer - 1], operands.pop()
-                gradient = torch.bmm(gradient, weights[layer].mT).to(z.dtype)
-                gradient = self._activation.backward(gradient, z, units.to(z.dtype))
-        for coefficient, by_weight, weight in zip(
-            self.decay, self._by_weights, self._weights, strict=False
-        ):
-            by_weight.add_(weight, alpha=coefficient)
+        z = self.model.network_inputs(inputs)
+        for layer in self._layers:
+            z = layer.forward(z)
+        losses, gradient = self._head(z.to(inputs.dtype), inputs, target)
+        for layer in reversed(self._layers):
+            gradient = layer.backward(gradient)
+        for coefficient, layer in zip(self.decay, self._layers, strict=False):
+            layer.by_weight.add_(layer.weight, alpha=coefficient)
         return losses
 
     def _head(self, output: Tensor, inputs: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
@@ -131,6 +108,75 @@ class TrainingStep:
         losses, by_raw = model.head.loss_and_gradient(raw.detach(), target)
         (gradient,) = torch.autograd.grad(raw, output, by_raw)
         return losses, gradient
+
+
+class _Layer:
+    """A layer of all members and its gradients, in the precision of its parameters.
+
+    Args:
+        weight: ``(E, in, out)``.
+        bias: ``(E, 1, out)``.
+        activation: of what the layer before gives; of the inputs there is none.
+    """
+
+    def __init__(self, weight: Tensor, bias: Tensor, activation: Activation | None = None) -> None:
+        self.weight, self.bias, self.activation = weight.detach(), bias.detach(), activation
+        self.by_weight, self.by_bias = _gradient(weight), _gradient(bias)
+
+    def forward(self, z: Tensor) -> Tensor:
+        """What the layer before gives, ``(E, B, in)``, to what this one gives ``(E, B, out)``."""
+        self._z = z
+        self._units = self.activation.value(z) if self.activation else z
+        return torch.bmm(self._units, self.weight).add_(self.bias)
+
+    def backward(self, gradient: Tensor) -> Tensor:
+        """Set the gradients by the parameters; that by ``z`` from that by what came of it."""
+        torch.sum(gradient, 1, True, out=self.by_bias)
+        torch.bmm(self._units.mT, gradient, out=self.by_weight)
+        if self.activation is None:
+            return gradient
+        gradient = torch.bmm(gradient, self.weight.mT)
+        return self.activation.backward(gradient, self._z, self._units)
+
+
+class _LowLayer(_Layer):
+    """As :class:`_Layer`, in bfloat16.
+
+    The bias is the weight of one more unit, which is always one: additions and sums over the rows
+    take as long as the products there.
+    """
+
+    activation: Activation
+
+    def __init__(self, weight: Tensor, bias: Tensor, activation: Activation) -> None:
+        super().__init__(weight, bias, activation)
+        members, width, out = weight.shape
+        filled = -(-(width + 1) // ALIGNMENT) * ALIGNMENT
+        self._low = weight.new_zeros(members, filled, out, dtype=torch.bfloat16)
+        self._by_low = torch.empty_like(self._low)
+        self._read = self._low.new_empty(members, 0, filled)
+
+    def forward(self, z: Tensor) -> Tensor:
+        rows, width = z.shape[1:]
+        if self._read.shape[1] != rows:
+            self._read = self._low.new_zeros(z.shape[0], rows, self._low.shape[1])
+            self._read[..., width] = 1
+        self._z, self._units = z, self._read[..., :width]
+        if z.dtype == self._units.dtype:
+            self.activation.into(z, self._units)
+        else:
+            self._units.copy_(self.activation.value(z))
+        self._low[:, :width] = self.weight
+        self._low[:, width] = self.bias[:, 0]
+        return torch.bmm(self._read, self._low)
+
+    def backward(self, gradient: Tensor) -> Tensor:
+        width, gradient = self._units.shape[-1], gradient.to(self._low.dtype)
+        torch.bmm(self._read.mT, gradient, out=self._by_low)
+        self.by_weight.copy_(self._by_low[:, :width])
+        self.by_bias.copy_(self._by_low[:, width, None])
+        gradient = torch.bmm(gradient, self._low[:, :width].mT).to(self._z.dtype)
+        return self.activation.backward(gradient, self._z, self._units)
 
 
 def _gradient(parameter: Tensor) -> Tensor:
