@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -13,7 +14,7 @@ from benchmarks import cheetah
 from benchmarks.peers import peer
 from benchmarks.tables import Table
 from benchmarks.timing import Row, interleave, ratio, spread
-from torchrl_l1.dynamics import FitConfig, fit_ensemble
+from torchrl_l1.dynamics import FitConfig, FitReport, fit_ensemble
 
 THREADS = 2
 BATCHES = 40
@@ -21,6 +22,9 @@ BATCH_SIZE = 256
 VALIDATION = 1024
 EPOCHS = 2
 LEARNING_RATE = 1e-3
+PRECISIONS = ("float32", "bfloat16")
+
+Case = tuple[str, str]
 
 # Of PETS, one per layer; mbrl-lib knows one for all.
 DECAYS: dict[str, tuple[list[float], float]] = {
@@ -37,23 +41,29 @@ def run(repetitions: int) -> list[Row]:
 
     Returns:
         One row per implementation and penalty: training samples times members per second
-        (``samples``), ``gflops`` per second, three times those of the predictions, and the
-        factor by which ours is faster (``speedup``).
+        (``samples``), ``gflops`` per second, three times those of the predictions, the
+        factor by which ours is faster (``speedup``), and the loss on the validation data in the
+        end, after equally many steps in either precision (``held_out``).
     """
     buffer = cheetah.transitions(BATCHES * BATCH_SIZE, VALIDATION)
     worker = peer(torch.get_num_threads())
-    cases: dict[tuple[str, str], Callable[[], object]] = {}
+    cases: dict[Case, Callable[[], object]] = {}
+    reports: dict[Case, FitReport] = {}
     for penalty, (decays, decay) in DECAYS.items():
-        model = cheetah.fitted_model(buffer, gradient_steps=1)
-        config = FitConfig(
-            batch_size=BATCH_SIZE,
-            max_epochs=EPOCHS,
-            max_gradient_steps=EPOCHS * BATCHES,
-            learning_rate=LEARNING_RATE,
-            weight_decay=decays,
-        )
-        optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE, fused=True)
-        cases[penalty, "torchrl_l1"] = partial(fit_ensemble, model, buffer, config, optimizer)
+        for precision in PRECISIONS:
+            model = cheetah.fitted_model(buffer, gradient_steps=1)
+            config = FitConfig(
+                batch_size=BATCH_SIZE,
+                max_epochs=EPOCHS,
+                max_gradient_steps=EPOCHS * BATCHES,
+                learning_rate=LEARNING_RATE,
+                weight_decay=decays,
+                precision=precision,
+            )
+            optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE, fused=True)
+            cases[penalty, precision] = partial(
+                _fit, reports, (penalty, precision), model, buffer, config, optimizer
+            )
         if worker is not None:
             with tempfile.TemporaryDirectory() as folder:
                 paths = {name: str(Path(folder) / f"{name}.pt") for name in ("model", "data")}
@@ -79,10 +89,17 @@ def run(repetitions: int) -> list[Row]:
         row: Row = {"penalty": penalty, "implementation": implementation}
         row |= spread("samples", [samples / value for value in values])
         row |= spread("gflops", [flops * samples / value for value in values])
-        if implementation == "torchrl_l1" and (penalty, "mbrl-lib") in seconds:
-            row |= ratio("speedup", seconds[penalty, "mbrl-lib"], values)
+        if report := reports.get((penalty, implementation)):
+            row["implementation"] = f"torchrl_l1, {implementation}"
+            row["held_out"] = report.validation_loss
+            if (penalty, "mbrl-lib") in seconds:
+                row |= ratio("speedup", seconds[penalty, "mbrl-lib"], values)
         rows.append(row)
     return rows
+
+
+def _fit(reports: dict[Case, FitReport], case: Case, *fit: Any) -> None:
+    reports[case] = fit_ensemble(*fit)
 
 
 def table(repetitions: int) -> Table:
@@ -94,7 +111,8 @@ def table(repetitions: int) -> Table:
         f"{EPOCHS} epochs included: `fit_ensemble` and mbrl-lib 0.2.0's `ModelTrainer`, both on "
         f"{BATCHES} batches of {BATCH_SIZE} per epoch, shuffled for each member, and five "
         "Gaussian members of 3 x 200 SiLU units (HalfCheetah, 17 observations, 6 actions). "
-        "GFLOP/s count the products of the model and of its gradients.",
+        "GFLOP/s count the products of the model and of its gradients; the held-out loss is that "
+        "after all repetitions.",
         run(repetitions),
         {
             "penalty": "penalty",
@@ -102,6 +120,7 @@ def table(repetitions: int) -> Table:
             "samples": "member-samples per second",
             "gflops": "GFLOP/s",
             "speedup": "times as fast as mbrl-lib",
+            "held_out": "held-out loss, nats",
         },
-        {"samples": ",.0f", "gflops": ",.0f"},
+        {"samples": ",.0f", "gflops": ",.0f", "held_out": ".4f"},
     )
