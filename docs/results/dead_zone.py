@@ -1,0 +1,111 @@
+"""Why the robust controller loses under a dead zone of the actuators.
+
+    python docs/results/dead_zone.py RUN
+
+A dead zone is a disturbance that changes sign with the action. Writes `dead_zone.md` beside this
+file, for 8 episodes of the mean action from the resets of the suite: the oracle, which undoes it at
+every step; the same a step late, or with a running mean of what it would have added, which is what
+the best estimator could know; the robust controller, and one whose filter does not expect a
+disturbance to end at the actuators' bounds. Beside the returns the mean over an episode of the
+estimate, as that of the true disturbance: root mean square over actuators and episodes.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_l1.algorithms import collection
+from torchrl_l1.algorithms.collection import episode_returns
+from torchrl_l1.control import L1Config, OracleTransform, kalman_law
+from torchrl_l1.control.kalman import Posterior
+from torchrl_l1.experiment.evaluate import TrainedRun, load_run, make_collection
+from torchrl_l1.experiment.matrix import Condition
+from torchrl_l1.report.page import markdown
+
+EPISODES, SEED, WIDTH, SETTLED = 8, 0, 0.2, 200
+TIME_CONSTANTS = (0, 3, 10, 30, 100)
+
+
+class LateOracle(OracleTransform):
+    """Adds a running mean of what the oracle would have added at the steps before."""
+
+    share = 1.0
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._mean: Tensor | None = None
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict[self.action_key]
+        wanted = action
+        for compensate in self._compensations():
+            wanted = compensate(wanted)
+        now = wanted - action
+        mean = torch.zeros_like(now) if self._mean is None else self._mean
+        self._mean = mean + self.share * (now - mean)
+        space = self._action_spec().space
+        executed = (action + mean).clamp(space.low, space.high)
+        tensordict.set(self.action_key, executed)
+        return tensordict.set("_oracle_executed", executed)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return next_tensordict.set((self.key, "u_exec"), tensordict["_oracle_executed"])
+
+
+class Unbounded(kalman_law.Reach):
+    """All of a disturbance comes through, whatever the bounds of the action are."""
+
+    @classmethod
+    def of(cls, config: L1Config, executed: Tensor, posterior: Posterior) -> Unbounded:
+        """As :meth:`Reach.of`."""
+        mean = posterior.mean
+        return cls(mean, torch.ones_like(mean, dtype=torch.bool), torch.zeros_like(mean))
+
+
+def row(trained: TrainedRun, l1: str, name: str) -> dict[str, Any]:
+    """One controller."""
+    cell = {"policy": "deterministic", "disturbances": {"deadzone": WIDTH}}
+    data = make_collection(trained, Condition(l1, **cell), EPISODES).evaluate(SEED)
+    returns = episode_returns(data)
+    error = float(returns.std()) / EPISODES**0.5
+    line = {"controller": name, "return": f"{float(returns.mean()):.0f} ± {error:.0f}"}
+    if l1 == "robust":
+        executed, estimate = (data["next", "l1", key] for key in ("u_exec", "sigma_m"))
+        true = executed.sign() * (executed.abs() - WIDTH).clamp(min=0) - executed
+        for column, values in (("mean estimate", estimate), ("true mean", true)):
+            line[column] = f"{float(values[:, SETTLED:].mean(1).square().mean().sqrt()):.2f}"
+    print(line, [round(value) for value in returns.tolist()], flush=True)
+    return line
+
+
+def main(path: str) -> None:
+    """All of it."""
+    trained = load_run(path)
+    lines = [
+        row(trained, "off", "none"),
+        row(trained, "oracle", "oracle, at every step"),
+        row(trained, "robust", "robust"),
+    ]
+    kalman_law.Reach = Unbounded  # type: ignore[misc]
+    lines.append(row(trained, "robust", "robust, nothing ends at the bounds"))
+    collection.OracleTransform = LateOracle  # type: ignore[misc]
+    for steps in TIME_CONSTANTS:
+        LateOracle.share = 1 / (1 + steps)
+        name = f"oracle, mean over {steps} steps before" if steps else "oracle, one step late"
+        lines.append(row(trained, "oracle", name))
+    filled = [{"mean estimate": "", "true mean": "", **line} for line in lines]
+    columns = ("controller", "return", "mean estimate", "true mean")
+    table = markdown([{column: line[column] for column in columns} for line in filled])
+    target = Path(__file__).with_suffix(".md")
+    target.write_text(table + "\n")
+    print(f"Table: {target}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
