@@ -24,6 +24,7 @@ from torchrl_l1.algorithms import collection
 from torchrl_l1.algorithms.collection import episode_returns
 from torchrl_l1.control import L1Config, OracleTransform, kalman_law
 from torchrl_l1.control.kalman import Posterior
+from torchrl_l1.envs import action_bounds, get_task
 from torchrl_l1.experiment.evaluate import TrainedRun, load_run, make_collection
 from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.report.page import markdown
@@ -84,9 +85,33 @@ def row(trained: TrainedRun, l1: str, name: str) -> dict[str, Any]:
     return line
 
 
+@torch.no_grad()
+def residuals(trained: TrainedRun) -> str:
+    """What the model misses of the motion without a controller, and how often inputs are bounds."""
+    cell = {"policy": "deterministic", "disturbances": {"deadzone": WIDTH}}
+    data = make_collection(trained, Condition("off", **cell), EPISODES).evaluate(SEED).flatten()
+    dynamics, (low, high) = trained.algorithm.dynamics, action_bounds(get_task(trained.recipe.task))
+    observation, action = data["observation"], data["action"].clamp(low, high)
+    true = action.sign() * (action.abs() - WIDTH).clamp(min=0) - action
+    change, jacobian = dynamics.value_and_jacobian(observation, action)
+    missed = data["next", "observation"] - observation - change
+    factor = torch.linalg.cholesky(dynamics.residuals.covariance)
+    squares = [
+        float(torch.linalg.solve_triangular(factor, each.mT, upper=False).square().mean())
+        for each in (missed, missed - (jacobian @ true[..., None])[..., 0])
+    ]
+    bound = float((action.abs() >= 0.99 * high).float().mean())
+    return (
+        "Without a controller the mean square of the model's whitened residuals is "
+        f"{squares[0]:.1f}, and {squares[1]:.2f} once the effect of the true disturbance is "
+        f"subtracted; {bound:.0%} of the inputs are at their bounds."
+    )
+
+
 def main(path: str) -> None:
     """All of it."""
     trained = load_run(path)
+    note = residuals(trained)
     lines = [
         row(trained, "off", "none"),
         row(trained, "oracle", "oracle, at every step"),
@@ -103,7 +128,7 @@ def main(path: str) -> None:
     columns = ("controller", "return", "mean estimate", "true mean")
     table = markdown([{column: line[column] for column in columns} for line in filled])
     target = Path(__file__).with_suffix(".md")
-    target.write_text(table + "\n")
+    target.write_text(f"{table}\n\n{note}\n")
     print(f"Table: {target}")
 
 
