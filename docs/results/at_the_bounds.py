@@ -1,18 +1,21 @@
-"""Why the robust controller loses under a dead zone of the actuators.
+"""Why the robust controller loses where actuators at their bounds push less than they should.
 
-    python docs/results/dead_zone.py RUN
+    python docs/results/at_the_bounds.py RUN deadzone 0.2
+    python docs/results/at_the_bounds.py RUN gain 0.6
 
-A dead zone is a disturbance that changes sign with the action. Writes `dead_zone.md` beside this
-file, for 8 episodes of the mean action from the resets of the suite: the oracle, which undoes it at
-every step; the same a step late, or with a running mean of what it would have added, which is what
-the best estimator could know; the robust controller, and one whose filter does not expect a
-disturbance to end at the actuators' bounds. Beside the returns the mean over an episode of the
-estimate, as that of the true disturbance: root mean square over actuators and episodes.
+A dead zone and a lower gain are disturbances that change sign with the action. Writes
+`at_the_bounds/TASK_NAME.md` beside this file, for 8 episodes of the mean action from the resets of
+the suite: the oracle, which undoes it at every step; the same a step late, or with a running mean
+of what it would have added, which is what the best estimator could know; the robust controller, and
+one whose filter does not expect a disturbance to end at the actuators' bounds. Beside the returns
+the mean over an episode of the estimate, as that of the true disturbance: root mean square over
+actuators and episodes.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +32,16 @@ from torchrl_l1.experiment.evaluate import TrainedRun, load_run, make_collection
 from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.report.page import markdown
 
-EPISODES, SEED, WIDTH, SETTLED = 8, 0, 0.2, 200
+EPISODES, SEED, SETTLED = 8, 0, 200
 TIME_CONSTANTS = (0, 3, 10, 30, 100)
+TRUE: dict[str, Callable[[Tensor, float], Tensor]] = {
+    "deadzone": lambda u, width: u.sign() * (u.abs() - width).clamp(min=0) - u,
+    "gain": lambda u, gain: (gain - 1) * u,
+}
+"""What a disturbance adds to an input."""
+
+
+Disturbance = tuple[str, float]
 
 
 class LateOracle(OracleTransform):
@@ -69,16 +80,16 @@ class Unbounded(kalman_law.Reach):
         return cls(mean, torch.ones_like(mean, dtype=torch.bool), torch.zeros_like(mean))
 
 
-def row(trained: TrainedRun, l1: str, name: str) -> dict[str, Any]:
+def row(trained: TrainedRun, disturbance: Disturbance, l1: str, name: str) -> dict[str, Any]:
     """One controller."""
-    cell = {"policy": "deterministic", "disturbances": {"deadzone": WIDTH}}
+    cell = {"policy": "deterministic", "disturbances": dict([disturbance])}
     data = make_collection(trained, Condition(l1, **cell), EPISODES).evaluate(SEED)
     returns = episode_returns(data)
     error = float(returns.std()) / EPISODES**0.5
     line = {"controller": name, "return": f"{float(returns.mean()):.0f} ± {error:.0f}"}
     if l1 == "robust":
         executed, estimate = (data["next", "l1", key] for key in ("u_exec", "sigma_m"))
-        true = executed.sign() * (executed.abs() - WIDTH).clamp(min=0) - executed
+        true = TRUE[disturbance[0]](executed, disturbance[1])
         for column, values in (("mean estimate", estimate), ("true mean", true)):
             line[column] = f"{float(values[:, SETTLED:].mean(1).square().mean().sqrt()):.2f}"
     print(line, [round(value) for value in returns.tolist()], flush=True)
@@ -86,13 +97,13 @@ def row(trained: TrainedRun, l1: str, name: str) -> dict[str, Any]:
 
 
 @torch.no_grad()
-def residuals(trained: TrainedRun) -> str:
+def residuals(trained: TrainedRun, disturbance: Disturbance) -> str:
     """What the model misses of the motion without a controller, and how often inputs are bounds."""
-    cell = {"policy": "deterministic", "disturbances": {"deadzone": WIDTH}}
+    cell = {"policy": "deterministic", "disturbances": dict([disturbance])}
     data = make_collection(trained, Condition("off", **cell), EPISODES).evaluate(SEED).flatten()
     dynamics, (low, high) = trained.algorithm.dynamics, action_bounds(get_task(trained.recipe.task))
     observation, action = data["observation"], data["action"].clamp(low, high)
-    true = action.sign() * (action.abs() - WIDTH).clamp(min=0) - action
+    true = TRUE[disturbance[0]](action, disturbance[1])
     change, jacobian = dynamics.value_and_jacobian(observation, action)
     missed = data["next", "observation"] - observation - change
     factor = torch.linalg.cholesky(dynamics.residuals.covariance)
@@ -108,29 +119,29 @@ def residuals(trained: TrainedRun) -> str:
     )
 
 
-def main(path: str) -> None:
+def main(path: str, name: str, value: str) -> None:
     """All of it."""
-    trained = load_run(path)
-    note = residuals(trained)
+    trained, disturbance = load_run(path), (name, float(value))
+    note = residuals(trained, disturbance)
     lines = [
-        row(trained, "off", "none"),
-        row(trained, "oracle", "oracle, at every step"),
-        row(trained, "robust", "robust"),
+        row(trained, disturbance, "off", "none"),
+        row(trained, disturbance, "oracle", "oracle, at every step"),
+        row(trained, disturbance, "robust", "robust"),
     ]
     kalman_law.Reach = Unbounded  # type: ignore[misc]
-    lines.append(row(trained, "robust", "robust, nothing ends at the bounds"))
+    lines.append(row(trained, disturbance, "robust", "robust, nothing ends at the bounds"))
     collection.OracleTransform = LateOracle  # type: ignore[misc]
     for steps in TIME_CONSTANTS:
         LateOracle.share = 1 / (1 + steps)
-        name = f"oracle, mean over {steps} steps before" if steps else "oracle, one step late"
-        lines.append(row(trained, "oracle", name))
+        late = f"oracle, mean over {steps} steps before" if steps else "oracle, one step late"
+        lines.append(row(trained, disturbance, "oracle", late))
     filled = [{"mean estimate": "", "true mean": "", **line} for line in lines]
     columns = ("controller", "return", "mean estimate", "true mean")
     table = markdown([{column: line[column] for column in columns} for line in filled])
-    target = Path(__file__).with_suffix(".md")
+    target = Path(__file__).with_suffix("") / f"{trained.recipe.task}_{name}.md"
     target.write_text(f"{table}\n\n{note}\n")
     print(f"Table: {target}")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])
