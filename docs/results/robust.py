@@ -43,7 +43,7 @@ def read(file: Path) -> list[Row]:
 
 
 def gather(folder: Path, task: str) -> None:
-    """Keep the episodes of all seeds of a task in one file; seeds that are not new keep theirs."""
+    """Keep the episodes of all seeds and controllers of a task in one file, the new in place."""
     rows = []
     for file in sorted(folder.glob(f"{task}/seed_*/*/episodes.csv")):
         rows += [{**row, "run": file.parts[-3]} for row in read(file)]
@@ -51,8 +51,9 @@ def gather(folder: Path, task: str) -> None:
         return
     HERE.mkdir(exist_ok=True)
     kept = HERE / f"{task}.csv"
-    new = {row["run"] for row in rows}
-    old = [row for row in read(kept) if row["run"] not in new] if kept.exists() else []
+    new = {(row["run"], row["l1"]) for row in rows}
+    before = read(kept) if kept.exists() else []
+    old = [row for row in before if (row["run"], row["l1"]) not in new]
     write_table(kept, sorted(old + rows, key=lambda row: row["run"]))
 
 

@@ -4,7 +4,7 @@
 
 Reads the episodes that `torchrl-l1 evaluate --suite quick` (or `full`) wrote into
 FOLDER/TASK/seed_N, if a FOLDER is given, and keeps their returns in `suite/TASK.csv` beside this
-file, in place of those of the same policy. Writes from those `suite/TASK.md`, one row per
+file, in place of those of the same policy and controller. Writes from those `suite/TASK.md`, one row per
 disturbance, `suite/TASK_values.md`, one row per value of it, and `suite/verdicts.md` and `.png`,
 disturbances by tasks.
 """
@@ -53,7 +53,7 @@ def cell_of(row: dict[str, str]) -> Cell:
 
 
 def gather(folder: Path, task: str) -> None:
-    """Keep the returns of all policies of a task in one file."""
+    """Keep the returns of all policies and controllers of a task in one file."""
     rows: dict[tuple[str, str, str, float], list[str]] = {}
     for file in sorted(folder.glob(f"{task}/seed_*/episodes.csv")):
         with file.open(newline="") as handle:
@@ -63,12 +63,12 @@ def gather(folder: Path, task: str) -> None:
     if not rows:
         return
     HERE.mkdir(exist_ok=True)
-    kept, new = HERE / f"{task}.csv", {key[0] for key in rows}
+    kept, new = HERE / f"{task}.csv", {key[:2] for key in rows}
     names = ("run", "l1", "disturbance", "value", "returns")
     if kept.exists():
         with kept.open(newline="") as handle:
             for old in csv.DictReader(handle):
-                if old["run"] not in new:
+                if (old["run"], old["l1"]) not in new:
                     key = (old["run"], old["l1"], old["disturbance"], float(old["value"]))
                     rows[key] = old["returns"].split()
     lines = [dict(zip(names, (*key, " ".join(rows[key])), strict=True)) for key in sorted(rows)]
