@@ -4,9 +4,9 @@
 
 Reads the episodes that `torchrl-l1 evaluate --suite quick` (or `full`) wrote into
 FOLDER/TASK/seed_N, if a FOLDER is given, and keeps their returns in `suite/TASK.csv` beside this
-file, in place of those of the same policy and controller. Writes from those `suite/TASK.md`, one row per
-disturbance, `suite/TASK_values.md`, one row per value of it, and `suite/verdicts.md` and `.png`,
-disturbances by tasks.
+file, in place of those of the same policy and controller. Writes from those `suite/TASK.md`, one
+row per disturbance, `suite/TASK_values.md`, one row per value of it, and `suite/verdicts.md` and
+`.png`, disturbances by tasks.
 """
 
 from __future__ import annotations
