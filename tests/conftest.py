@@ -6,10 +6,11 @@ import runpy
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Protocol
+from types import SimpleNamespace
+from typing import IO, Protocol
 
 import pytest
 from omegaconf import DictConfig
@@ -35,6 +36,7 @@ TINY = [
 
 HAS_FORKS = sys.platform.startswith("linux")
 FORKED = Path(__file__).with_name("forked.py")
+SEARCH_PATH = [part for part in sys.path if part]
 # All that a run and an evaluation load.
 PRELOADED = (
     "torchrl_l1.campaign.command",
@@ -88,10 +90,25 @@ class Started:
 
 
 class Forked(Started):
-    """A process of the command line, forked from one that has loaded the package."""
+    """A process of the command line, forked from one that has loaded the package.
 
-    def __init__(self, arguments: Sequence[str], output: Path) -> None:
-        request = ("torchrl_l1.cli", list(arguments), str(output))
+    Args:
+        arguments: of the command line, or of another module.
+        output: file for all that it writes.
+        path: what Python searches; by default what it does here.
+        worker: whether it is of a campaign in this process, which gives it a session of its own.
+    """
+
+    def __init__(
+        self,
+        arguments: Sequence[str],
+        output: Path,
+        path: Sequence[str] | None = None,
+        module: str = "torchrl_l1.cli",
+        worker: bool = False,
+    ) -> None:
+        place = (os.getcwd(), list(sys.path if path is None else path), worker)
+        request = (module, list(arguments), str(output), place)
         super().__init__(
             multiprocessing.get_context("forkserver").Process(
                 target=runpy.run_path,
@@ -99,6 +116,23 @@ class Forked(Started):
                 kwargs={"init_globals": {"REQUEST": request}, "run_name": "__main__"},
             )
         )
+
+
+def forked_worker(
+    command: Sequence[str],
+    *,
+    stdin: int,
+    stdout: IO[bytes],
+    stderr: int,
+    env: Mapping[str, str],
+    start_new_session: bool,
+) -> Forked:
+    """As much of ``subprocess.Popen`` as a campaign in this process needs for its workers."""
+    interpreter, option, module, *arguments = command
+    assert (interpreter, option) == (sys.executable, "-m")
+    assert (stdin, stderr) == (subprocess.DEVNULL, subprocess.STDOUT) and start_new_session
+    path = [os.getcwd(), *SEARCH_PATH]
+    return Forked(arguments, Path(stdout.name), path, module, worker=True)
 
 
 def started_anew(arguments: Sequence[str], output: Path) -> subprocess.Popen[bytes]:
@@ -127,6 +161,33 @@ def start_cli(tmp_path: Path) -> Callable[..., Process]:
         return starter(arguments, output or tmp_path / "output")
 
     return start
+
+
+@pytest.fixture
+def forked_processes() -> Iterator[None]:
+    """Lets other libraries fork their processes from one that has loaded the package.
+
+    A process that is spawned loads everything anew, which takes seconds of CPU; what it is sent is
+    pickled in both cases.
+    """
+    before = multiprocessing.get_start_method(allow_none=True)
+    if HAS_FORKS:
+        multiprocessing.set_start_method("forkserver", force=True)
+    yield
+    multiprocessing.set_start_method(before, force=True)
+
+
+@pytest.fixture
+def forked_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forks the workers of campaigns in this process from one that has loaded the package."""
+    from torchrl_l1.campaign import workers
+
+    if HAS_FORKS:
+        names = {name: getattr(subprocess, name) for name in ("DEVNULL", "STDOUT")}
+        given = SimpleNamespace(
+            Popen=forked_worker, TimeoutExpired=subprocess.TimeoutExpired, **names
+        )
+        monkeypatch.setattr(workers, "subprocess", given)
 
 
 @pytest.fixture

@@ -91,13 +91,30 @@ def status_of(module: str, arguments: Sequence[str]) -> int:
     return 0
 
 
-def main(module: str, arguments: Sequence[str], output: str) -> None:
-    """Run a module, with its standard output and error in a file."""
+Place = tuple[str, list[str], bool]
+
+
+def main(module: str, arguments: Sequence[str], output: str, place: Place | None = None) -> None:
+    """Run a module, with its standard output and error in a file.
+
+    Args:
+        module: its name.
+        arguments: of the command line.
+        output: the file.
+        place: the folder, what Python searches, and whether it is the worker of a campaign in
+            another process: then it has a session of its own, and its parent is not the campaign.
+    """
     import torch
 
     from torchrl_l1.campaign import workers
 
     torch.set_num_threads(1)
+    if place is not None:
+        folder, sys.path[:], worker = place
+        os.chdir(folder)
+        if worker:
+            os.setsid()
+            arguments = [str(os.getppid()), *arguments[1:]]
     workers.subprocess = SimpleNamespace(
         Popen=Fork,
         DEVNULL=subprocess.DEVNULL,

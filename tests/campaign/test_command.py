@@ -82,7 +82,7 @@ def test_killed_campaign_loses_at_most_the_running_iterations(
     runs = planned(campaign_file, output, *slower)
     arguments = command(campaign_file, output, *slower)
     log = campaign_file.with_suffix(".log")
-    process = start_cli(arguments, log, anew=True)
+    process = start_cli(arguments, log)
     while process.poll() is None and not any(map(timings, runs)):
         time.sleep(0.005)
     time.sleep(random.uniform(0, max(map(mean_seconds, runs))))
@@ -224,6 +224,7 @@ def test_changed_settings_and_a_second_campaign_are_refused(
     assert (output / "campaign.yaml").read_text() == before
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_recipe_edited_meanwhile_changes_no_planned_run(campaign_file: Path) -> None:
     recipe = campaign_file.with_name("own.yaml")
     text = "defaults: [metrpo_recipe, _self_]\nrecipe: own\ntask: inverted_pendulum\n"

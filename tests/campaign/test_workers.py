@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -154,18 +152,3 @@ def test_environment_has_one_thread(make_job: MakeJob) -> None:
     assert workers(1).work([job]) == []
     assert job.log.read_text() == "1 1\n"
     assert 1 <= available_cores() <= (os.cpu_count() or 1)
-
-
-def test_the_modules_load_without_what_windows_lacks() -> None:
-    script = """
-import os, signal, sys
-import torchrl_l1
-for module in ("fcntl", "pwd", "grp", "resource", "termios"):
-    sys.modules[module] = None
-for name in ("killpg", "EX_TEMPFAIL", "sched_getaffinity", "setsid"):
-    delattr(os, name)
-del signal.SIGKILL
-import torchrl_l1.campaign.child, torchrl_l1.campaign.command, torchrl_l1.campaign.workers
-assert torchrl_l1.campaign.workers.available_cores() >= 1
-"""
-    subprocess.run([sys.executable, "-c", script], check=True)

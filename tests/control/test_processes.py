@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import multiprocessing
+
 import pytest
 import torch
 from tensordict import TensorDictBase
@@ -87,6 +89,7 @@ def assert_is_the_core(data: TensorDictBase, u_rl: Tensor) -> None:
     assert ((u - u_rl).abs() > 0.05).any() and begins.any()
 
 
+@pytest.mark.usefixtures("forked_processes")
 @pytest.mark.parametrize("backend", ["threading", "multiprocessing"])
 def test_in_a_pool(backend):
     options = {"exchange": "queue"} if backend == "multiprocessing" else {}
@@ -110,7 +113,9 @@ def test_in_a_pool(backend):
 
 @pytest.mark.parametrize("kind", [MultiSyncCollector, MultiAsyncCollector])
 @pytest.mark.parametrize("face", ["transform", "controller"])
-def test_in_collectors_with_processes(kind, face):
+def test_in_collectors_with_processes(kind, face, forked_processes):
+    if (face, kind) == ("transform", MultiSyncCollector):
+        multiprocessing.set_start_method("spawn", force=True)  # once as TorchRL does it
     policy = TensorDictModule(act, ["observation"], ["action"])
     make = make_env
     if face == "controller":

@@ -392,7 +392,8 @@ def test_around_a_vectorised_gym_environment(model):
     env.close()
 
 
-@pytest.mark.parametrize("kind", ["serial", "spawned"])
+@pytest.mark.usefixtures("forked_processes")
+@pytest.mark.parametrize("kind", ["serial", "processes"])
 def test_inside_a_batched_environment(kind, model, actor):
     def make():
         l1 = L1Transform(model, CONFIG)

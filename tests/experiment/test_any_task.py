@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import csv
-import os
-import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
 
+from tests.conftest import Process
 from torchrl_l1.campaign import read_campaign
 from torchrl_l1.campaign.jobs import sweep
 from torchrl_l1.campaign.plan import plan
@@ -85,17 +84,6 @@ def rows(file: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(handle))
 
 
-def apart(arguments: Sequence[str], folder: Path) -> str:
-    """The command as a process of its own, as users give it: the folder is not on Python's path."""
-    script = "import sys; sys.path.remove(''); from torchrl_l1.cli import main; main()"
-    done = subprocess.run(
-        [sys.executable, "-c", script, *arguments], cwd=folder, text=True,
-        capture_output=True, env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 def test_a_file_beside_the_recipe_is_found_from_everywhere(
     place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -121,13 +109,17 @@ def test_a_file_beside_the_recipe_is_found_from_everywhere(
 
 
 @pytest.mark.parametrize("launcher", ["basic", "joblib"])
-def test_sweeps_over_packages_functions_and_files(launcher: str, place: Path) -> None:
+def test_sweeps_over_packages_functions_and_files(
+    launcher: str, place: Path, start_cli: Callable[..., Process]
+) -> None:
     """In a process of its own, whose path does not have the folder, and in the launcher's."""
     if launcher == "joblib":
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     tasks = ",".join(NAMES)
     more = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"] if launcher == "joblib" else []
-    apart(["run", "pets/any", "-m", f"task={tasks}", "reward=rafts:reward", *TINY, *more], place)
+    arguments = ["run", "pets/any", "-m", f"task={tasks}", "reward=rafts:reward", *TINY, *more]
+    assert str(place) not in sys.path
+    assert start_cli(arguments).wait() == 0, (place / "output").read_text()
     found = sorted(place.glob("runs/**/metrics.csv"))
     assert len(found) == 3
     names = {OmegaConf.load(file.with_name("config.yaml")).task for file in found}
@@ -136,6 +128,7 @@ def test_sweeps_over_packages_functions_and_files(launcher: str, place: Path) ->
     assert len({file.read_text() for file in found}) == 1
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_a_campaign_over_environments(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (place / "study.yaml").write_text(
         "runs:\n  - recipe: pets/any\n    overrides: ["
@@ -233,6 +226,7 @@ def test_a_suite_leaves_out_what_cannot_act_and_one_run_is_no_two_seeds(
     assert len(table) > 3 and all(float(row["payload"]) == 0 for row in table)
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_runs_of_another_folders_file_are_not_reused(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
