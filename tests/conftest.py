@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import runpy
@@ -37,12 +38,18 @@ TINY = [
 HAS_FORKS = sys.platform.startswith("linux")
 FORKED = Path(__file__).with_name("forked.py")
 SEARCH_PATH = [part for part in sys.path if part]
-# All that a run and an evaluation load.
+# All that commands load, now or later, W&B too.
 PRELOADED = (
     "torchrl_l1.campaign.command",
     "torchrl_l1.campaign.evaluation",
     "torchrl_l1.experiment.launch",
     "torchrl_l1.algorithms",
+    "torchrl_l1.cli.evaluate",
+    "torchrl_l1.cli.export",
+    "torchrl_l1.cli.play",
+    "torchrl_l1.cli.robustify",
+    "torchrl_l1.report",
+    "wandb.sdk.launch.inputs.internal",
 )
 
 if HAS_FORKS:
@@ -144,8 +151,23 @@ def started_anew(arguments: Sequence[str], output: Path) -> subprocess.Popen[byt
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest first, so that no worker waits for them in the end: those of processes."""
-    items.sort(key=lambda item: "start_cli" not in getattr(item, "fixturenames", ()))
+    """The longest first, so that no worker waits for them in the end: those of processes.
+
+    One worker gets them, and has the process that all are forked from.
+    """
+    forked = {"start_cli", "forked_workers", "forked_processes"}
+
+    def has_none(item: pytest.Item) -> bool:
+        fixtures = forked.intersection(getattr(item, "fixturenames", ()))
+        return not fixtures and item.path.stem != "test_attack"
+
+    items.sort(key=has_none)
+
+
+def pytest_collection_finish() -> None:
+    """Let the garbage collector leave alone what has been loaded: it stays to the end."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

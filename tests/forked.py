@@ -7,6 +7,7 @@ session, signals, standard streams and the end.
 
 from __future__ import annotations
 
+import gc
 import os
 import runpy
 import signal
@@ -108,6 +109,7 @@ def main(module: str, arguments: Sequence[str], output: str, place: Place | None
 
     from torchrl_l1.campaign import workers
 
+    gc.freeze()  # else a collection would copy every page of what is loaded
     torch.set_num_threads(1)
     if place is not None:
         folder, sys.path[:], worker = place

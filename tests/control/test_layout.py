@@ -143,7 +143,7 @@ def test_many_controllers_compile_in_one_process(monkeypatch):
     )
     model = ActionJacobian(lambda x, u: 0.1 * x + u.sin())
     with limit:
-        for k in range(4):
+        for k in range(3):
             config = L1Config(0.01 * (k + 1))
             batch = k % 3 + 1
             found, expected = init([batch], 3, 1), init([batch], 3, 1)
@@ -154,4 +154,4 @@ def test_many_controllers_compile_in_one_process(monkeypatch):
                 u_expected, expected, _ = augment(config, model, expected, x, u_rl)
                 torch.testing.assert_close(u, u_expected)
                 torch.testing.assert_close(found.x_hat, expected.x_hat)
-    assert len(graphs) == 4
+    assert len(graphs) == 3

@@ -73,7 +73,7 @@ def vector_env(task: str) -> gymnasium.vector.VectorEnv:
         (partial(ParallelEnv, 2, pendulum), None),
     ],
 )
-def test_time_step_of_environments(make, expected):
+def test_time_step_of_environments(make, expected, forked_processes):
     env = make()
     found = time_step(env)
     assert found == (None if expected is None else pytest.approx(expected, rel=1e-6))

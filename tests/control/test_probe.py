@@ -320,7 +320,7 @@ def test_threads_get_what_one_thread_gets():
 
     lazy = MLP(out_features=N, num_cells=[4])
     config = L1Config(0.05, epsilon=0.01, action_low=-1.0, action_high=1.0)
-    inputs = [data(3) for _ in range(100)]
+    inputs = [data(3) for _ in range(40)]
 
     def loop() -> list[torch.Tensor]:
         step, state, found = make_step(config, ActionJacobian(model), False), init([3], N, M), []

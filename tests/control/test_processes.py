@@ -114,14 +114,17 @@ def test_in_a_pool(backend):
 @pytest.mark.parametrize("kind", [MultiSyncCollector, MultiAsyncCollector])
 @pytest.mark.parametrize("face", ["transform", "controller"])
 def test_in_collectors_with_processes(kind, face, forked_processes):
+    count = 2
     if (face, kind) == ("transform", MultiSyncCollector):
-        multiprocessing.set_start_method("spawn", force=True)  # once as TorchRL does it
+        # Once as TorchRL does it: the process loads everything anew.
+        multiprocessing.set_start_method("spawn", force=True)
+        count = 1
     policy = TensorDictModule(act, ["observation"], ["action"])
     make = make_env
     if face == "controller":
         policy, make = TensorDictSequential(policy, make_controller()), make_primed_env
     collector = kind(
-        [make, make],
+        [make] * count,
         policy,
         frames_per_batch=24,
         total_frames=48,

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import copy
 import pickle
-import sys
 from dataclasses import replace
 from functools import partial
 
@@ -359,16 +358,15 @@ def assert_l1_is_right(data: TensorDictBase, model: EnsembleDynamics) -> None:
     assert data["next", "l1", "n_switch"].max() > 0
 
 
-# Forked from a process that has loaded the package, where the system does that well.
-START = "forkserver" if sys.platform.startswith("linux") else "spawn"
 BASES = {
     "one": pendulum,
     "own": lambda: BatchedMujocoEnv("inverted_pendulum", num_envs=2),
     "serial": lambda: SerialEnv(2, pendulum),
-    "parallel": lambda: ParallelEnv(2, pendulum, mp_start_method=START),
+    "parallel": lambda: ParallelEnv(2, pendulum),
 }
 
 
+@pytest.mark.usefixtures("forked_processes")
 @pytest.mark.parametrize("kind", BASES)
 def test_around_an_environment(kind, model, actor):
     env = with_l1(BASES[kind](), model)

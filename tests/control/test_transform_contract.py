@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from functools import partial
 
 import pytest
@@ -23,9 +22,6 @@ from torchrl.envs import (
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_l1.control import L1Transform
-
-# Forked from a process that has loaded the package, where the system does that well.
-START = "forkserver" if sys.platform.startswith("linux") else "spawn"
 
 
 def model(observation: Tensor, action: Tensor) -> Tensor:
@@ -63,8 +59,9 @@ def test_serial_trans_env_check():
     assert check(SerialEnv(2, transformed)).shape == (2, 6)
 
 
+@pytest.mark.usefixtures("forked_processes")
 def test_parallel_trans_env_check():
-    env = ParallelEnv(2, transformed, mp_start_method=START)
+    env = ParallelEnv(2, transformed)
     assert check(env).shape == (2, 6)
 
 
@@ -72,8 +69,9 @@ def test_trans_serial_env_check():
     assert check(transformed(partial(SerialEnv, 2, pendulum))).shape == (2, 6)
 
 
+@pytest.mark.usefixtures("forked_processes")
 def test_trans_parallel_env_check():
-    base = partial(ParallelEnv, 2, pendulum, mp_start_method=START)
+    base = partial(ParallelEnv, 2, pendulum)
     assert check(transformed(base)).shape == (2, 6)
 
 

@@ -33,7 +33,7 @@ METRICS = METRPO.facts.metrics.keys() - OUTCOME_METRICS.keys()
 
 Recipe = Callable[..., DictConfig]
 
-METRPO_RUN = ["outer_iterations=6", "fit.max_epochs=150", "fit.patience=150"]
+METRPO_RUN = ["outer_iterations=5", "fit.max_epochs=150", "fit.patience=150"]
 # Two rounds of shooting, two of cloning, two of fine-tuning.
 MBMF_RUN = [
     *("outer_iterations=6", "shooting_iterations=2", "cloning.iterations=2", "horizon=10"),
@@ -272,8 +272,8 @@ def test_interrupted_write_leaves_the_old_file(
 @pytest.mark.parametrize(
     ("recipe", "overrides", "rows_before_kill"),
     [
-        # Before the first checkpoint, then twice at a random moment of a later iteration.
-        ("metrpo/inverted_pendulum", METRPO_RUN, (0, 1, 3)),
+        # Before the first checkpoint, then at a random moment of a later iteration.
+        ("metrpo/inverted_pendulum", METRPO_RUN, (0, 2)),
         # Once in each stage.
         ("mbmf/inverted_pendulum", MBMF_RUN, (1, 3, 5)),
     ],
@@ -294,7 +294,8 @@ def test_killed_run_resumes_to_the_same_metrics(
         return start_cli([*command, f"run_dir={folder}"], anew=anew)
 
     unbroken, killed = tmp_path / "unbroken", tmp_path / "killed"
-    assert start(unbroken, anew=True).wait(timeout=300) == 0
+    # One of the interpreters is a new one, as users start it.
+    assert start(unbroken, anew=recipe.startswith("metrpo")).wait(timeout=300) == 0
     iteration = mean_seconds(unbroken)
     rng = random.Random(0)
     for count in rows_before_kill:
@@ -304,7 +305,7 @@ def test_killed_run_resumes_to_the_same_metrics(
         time.sleep(rng.uniform(0, iteration))
         process.kill()
         assert process.wait() == -signal.SIGKILL
-    assert rows(killed) < 6
+    assert rows(killed) < rows(unbroken)
     assert start(killed).wait(timeout=300) == 0
     assert (killed / "metrics.csv").read_text() == (unbroken / "metrics.csv").read_text()
 

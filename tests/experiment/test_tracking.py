@@ -267,11 +267,11 @@ def test_kills_at_random_moments_lose_nothing(
     tmp_path: Path, tiny_overrides: list[str], start_cli: Callable[..., Any]
 ) -> None:
     """Of processes that are forked; ``python -m tests.kills`` does it with whole ones."""
-    settings = [*tiny_overrides, OFFLINE, "outer_iterations=6", "fit.max_epochs=100"]
+    settings = [*tiny_overrides, OFFLINE, "outer_iterations=5", "fit.max_epochs=100"]
     folder = tmp_path / "run"
     command = ["run", "metrpo/inverted_pendulum", *settings, f"run_dir={folder}", "--resume"]
     rng = random.Random(0)
-    for rows in (0, 1, 3):
+    for rows in (0, 2):
         process = start_cli(command)
         while process.poll() is None and not logged(folder, rows):
             time.sleep(0.005)
@@ -281,7 +281,7 @@ def test_kills_at_random_moments_lose_nothing(
     assert start_cli(command).wait(timeout=300) == 0
     # One file or several: what a killed process has not written yet is removed and logged again.
     assert not settled(folder) and wandb_files(folder)
-    assert len((folder / "metrics.csv").read_text().splitlines()) == 7
+    assert len((folder / "metrics.csv").read_text().splitlines()) == 6
 
 
 def logged(folder: Path, rows: int) -> bool:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.stats import ttest_1samp
 
+from tests.report.conftest import run_directory
 from torchrl_l1.report import curves, report
 from torchrl_l1.report.comparison import (
     algorithm_pairs,
@@ -50,9 +53,32 @@ def disturbed(*policies: str) -> dict[str, list[dict[str, Any]]]:
     return {"disturbances": rows, "sim_to_real": rows, "ablation": rows}
 
 
+@contextmanager
+def kept_figures() -> Iterator[dict[str, Figure]]:
+    """Figures of learning curves that are drawn meanwhile, by the names of their files."""
+    figures: dict[str, Figure] = {}
+    save = curves.save
+
+    def keep(figure: Figure, file: Path) -> Path:
+        figures[file.stem] = figure
+        return save(figure, file)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(curves, "save", keep)
+        yield figures
+
+
 @pytest.fixture
-def three(write_run: WriteRun, tmp_path: Path) -> Path:
-    """METRPO, PETS and DETS on the pendulum, and PETS alone on HalfCheetah."""
+def drawn() -> Iterator[dict[str, Figure]]:
+    with kept_figures() as figures:
+        yield figures
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Figure]]:
+    """The report of METRPO, PETS and DETS on the pendulum, and PETS alone on HalfCheetah."""
+    folder = tmp_path_factory.mktemp("whole")
+    runs = (folder / "runs" / f"run_{number:03}" for number in itertools.count())
     rest = {"random": 0.1, "collect": 2.0, "evaluate": 0.25}
     for recipe, policies, phase in (
         (METRPO_PENDULUM, ("stochastic", "deterministic"), {"trpo": 3.0}),
@@ -63,27 +89,16 @@ def three(write_run: WriteRun, tmp_path: Path) -> Path:
         for noise in ("noise=none", STRONG):
             for arm in ("off", "paper"):
                 for seed in range(3):
-                    write_run(
-                        -np.geomspace(80, 0.1 + seed, 3), f"l1={arm}", noise, recipe=recipe,
-                        seed=seed, timings=timings, evaluations=disturbed(*policies),
-                        steps=2500 if phase else 100,
+                    run_directory(
+                        next(runs), (-np.geomspace(80, 0.1 + seed, 3)).tolist(), f"l1={arm}",
+                        noise, recipe=recipe, seed=seed, timings=timings,
+                        evaluations=disturbed(*policies), steps=2500 if phase else 100,
                     )  # fmt: skip
-    write_run([1, 2, 3], "l1=off", recipe="pets/half_cheetah")
-    return tmp_path / "runs"
-
-
-@pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, Figure]:
-    """Figures of learning curves by the names of their files."""
-    figures: dict[str, Figure] = {}
-    save = curves.save
-
-    def keep(figure: Figure, file: Path) -> Path:
-        figures[file.stem] = figure
-        return save(figure, file)
-
-    monkeypatch.setattr(curves, "save", keep)
-    return figures
+    run_directory(next(runs), [1, 2, 3], "l1=off", recipe="pets/half_cheetah")
+    (folder / "curves.csv").write_text(CURVES)
+    with kept_figures() as figures:
+        page = report([folder / "runs"], folder / "out", folder / "curves.csv")
+    return page, figures
 
 
 def labels(figure: Figure) -> list[str]:
@@ -92,10 +107,9 @@ def labels(figure: Figure) -> list[str]:
 
 
 def test_report_has_sections_of_each_algorithm_and_compares_them(
-    three: Path, tmp_path: Path
+    whole: tuple[Path, dict[str, Figure]],
 ) -> None:
-    (tmp_path / "curves.csv").write_text(CURVES)
-    page = report([three], tmp_path / "out", tmp_path / "curves.csv")
+    page, _ = whole
     text = page.read_text()
     assert "METRPO (12 runs), PETS (13 runs), DETS (12 runs)" in text
     headings = re.findall(r"^## (.*)$", text, re.MULTILINE)
@@ -121,10 +135,10 @@ def test_report_has_sections_of_each_algorithm_and_compares_them(
 
 
 def test_what_is_published_stands_beside_its_own_algorithm_only(
-    three: Path, drawn: dict[str, Figure], tmp_path: Path
+    whole: tuple[Path, dict[str, Figure]],
 ) -> None:
-    (tmp_path / "curves.csv").write_text(CURVES)
-    text = report([three], tmp_path / "out", tmp_path / "curves.csv").read_text()
+    page, drawn = whole
+    text = page.read_text()
     grey = {name for name, figure in drawn.items() if "authors' logs" in str(labels(figure))}
     assert len(drawn) == 5 and grey == {"metrpo_learning_curves_inverted_pendulum"}
     dashed = {name for name, figure in drawn.items() if "mean action" in labels(figure)}
@@ -148,7 +162,7 @@ def test_what_is_published_stands_beside_its_own_algorithm_only(
     assert "| paper, L1 off |" in found["METRPO: Sim to real"]
     for name in ("metrpo", "pets", "dets"):
         for table in ("training", "sim_to_real", "ablation"):
-            header = (tmp_path / "out" / f"{name}_{table}.csv").read_text().splitlines()[0]
+            header = page.with_name(f"{name}_{table}.csv").read_text().splitlines()[0]
             assert ("paper_mean" in header) == (name == "metrpo")
 
 
