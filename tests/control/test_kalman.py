@@ -24,7 +24,7 @@ def random_covariance(rng: np.random.Generator, n: int) -> np.ndarray:
     return correlated * np.outer(scale, scale)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 9), excess=st.integers(0, 6))
 def test_weighted_least_squares_has_the_textbook_solution(seed, n, excess):
     m = max(1, n - excess)
@@ -53,7 +53,7 @@ def test_a_covariance_that_is_not_positive_definite_gives_nothing_finite():
     assert not whitened(-torch.eye(2), torch.ones(2, 1))[0].isfinite().any()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 8), m=st.integers(1, 5))
 def test_the_update_is_that_of_kalman(seed, n, m):
     rng = np.random.default_rng(seed)

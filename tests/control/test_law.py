@@ -21,7 +21,7 @@ def tensors(*arrays: np.ndarray) -> list[torch.Tensor]:
     return [torch.as_tensor(array) for array in arrays]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
     n=st.integers(1, 9),
@@ -325,7 +325,7 @@ def test_shapes_that_do_not_fit_are_named():
 DTYPES = [torch.float32, torch.float64]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
     n=st.integers(1, 20),

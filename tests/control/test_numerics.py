@@ -26,7 +26,7 @@ def numbers(generator: torch.Generator, magnitude: float, *shape: int) -> torch.
 magnitudes = st.floats(-30, 30)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
     dtype=st.sampled_from(DTYPES),
@@ -83,7 +83,7 @@ def test_any_numbers_leave_the_action_finite_bounded_and_in_its_row(
         assert all(torch.equal(a[others], b[others]) for a, b in zip(before, after, strict=True))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
     dtype=st.sampled_from(DTYPES),
@@ -229,7 +229,7 @@ def test_effects_are_seen_in_relation_to_state_and_range():
     assert without_effect(torch.tensor([[0.1], [0.0]]).double(), clock, 1.0).tolist() == [False]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**31), m=st.integers(1, 4), dtype=st.sampled_from(HALF))
 def test_half_precision_is_solved_in_single_precision(seed, m, dtype):
     generator = torch.Generator().manual_seed(seed)

@@ -90,7 +90,7 @@ def test_agrees_with_an_explicit_loop(activation: str, hidden: tuple[int, ...]) 
     activation=st.sampled_from(sorted(ACTIVATIONS)),
     seed=st.integers(0, 1000),
 )
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_derivatives_agree_with_forward_mode(
     n: int, m: int, batch: int, hidden: list[int], activation: str, seed: int
 ) -> None:
@@ -115,7 +115,7 @@ def test_derivatives_agree_with_forward_mode(
     weights=st.lists(st.floats(-5, 5), min_size=1, max_size=4),
     scale=st.floats(1e-3, 1e3),
 )
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_affine_in_the_action_however_far(
     n: int, m: int, seed: int, weights: list[float], scale: float
 ) -> None:

@@ -46,7 +46,7 @@ def test_members_agree_with_torch_layers(activation: str) -> None:
     activation=st.sampled_from(sorted(ACTIVATIONS)),
     seed=st.integers(0, 1000),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_jacobian_agrees_with_autograd_through_the_normalisers(
     n: int, m: int, batch: int, hidden: list[int], activation: str, seed: int
 ) -> None:

@@ -33,7 +33,7 @@ def test_affine_model_has_the_size_of_the_nonlinear_one(n: int, m: int, hidden: 
     width=st.integers(1, 60),
     layers=st.integers(1, 3),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_no_other_width_is_closer(n: int, m: int, width: int, layers: int) -> None:
     target = count(EnsembleDynamics(n, m, members=1, hidden=[width] * layers))
     found = matched_hidden(n, m, [width] * layers)

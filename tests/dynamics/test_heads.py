@@ -30,7 +30,7 @@ def bounded(raw: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 @given(seed=st.integers(0, 2**16), dim=st.integers(1, 4), scale=st.floats(0.1, 5.0))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_loss_and_gradients_are_those_of_a_normal_distribution(
     seed: int, dim: int, scale: float
 ) -> None:
@@ -123,7 +123,7 @@ def test_what_a_fit_needs_is_what_autograd_says(
     low=st.floats(-12, -1),
     gap=st.floats(0.5, 8),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_the_variance_is_bounded_whatever_the_network_says(
     raw: list[float], low: float, gap: float
 ) -> None:

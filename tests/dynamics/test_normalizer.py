@@ -14,7 +14,7 @@ from torchrl_l1.dynamics import DataBox, Normalizer
     scale=st.floats(1e-2, 1e3),
     seed=st.integers(0, 2**16),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_statistics_agree_with_numpy_in_double_precision(
     offset: float, scale: float, seed: int
 ) -> None:

@@ -29,7 +29,7 @@ def test_many_residuals_have_the_covariance_that_they_were_drawn_from():
     np.testing.assert_allclose(found / scale, expected / scale, atol=0.04)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
     count=st.integers(1, 30),

@@ -172,10 +172,10 @@ def test_only_the_unclamped_pendulum_feels_inputs_beyond_its_range():
     ("name", "num_envs", "low", "high"),
     # An independent reimplementation's mean and deviation over episodes; arXiv:1907.02057's.
     [
-        ("inverted_pendulum", 50, -228, -210),  # -219 +- 9; -205 +- 14
-        ("swimmer", 20, -18.5, -2.9),  # -10.7 +- 7.8; -9.5 +- 12
-        ("hopper", 20, -3167, -2177),  # -2672 +- 495; -2573 +- 631
-        ("half_cheetah", 25, -330, -200),  # -242 +- 42; -288 +- 66
+        ("inverted_pendulum", 25, -228, -210),  # -219 +- 9; -205 +- 14
+        ("swimmer", 10, -18.5, -2.9),  # -10.7 +- 7.8; -9.5 +- 12
+        ("hopper", 10, -3167, -2177),  # -2672 +- 495; -2573 +- 631
+        ("half_cheetah", 10, -330, -200),  # -242 +- 42; -288 +- 66
     ],
 )
 def test_random_policy_returns(name, num_envs, low, high):

@@ -55,7 +55,7 @@ def some_policy(n: int, m: int, hidden: list[int]) -> GaussianPolicy:
     fraction=st.sampled_from([1.0, 0.3]),
     seed=st.integers(0, 2**16),
 )
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_derivatives_are_those_of_autograd(
     n: int, m: int, hidden: list[int], fraction: float, seed: int
 ) -> None:

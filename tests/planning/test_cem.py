@@ -80,7 +80,7 @@ def test_costs_within_one_percent_of_the_riccati_solution(linear):
     assert -result.best_return.item() + first == pytest.approx(cost, rel=0.01)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 10_000),
     share=st.floats(0, 1),

@@ -158,7 +158,7 @@ def by_hand(model, x, actions, change) -> torch.Tensor:
     return total
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     particles=st.integers(1, 12),
     elites=st.lists(st.integers(0, 4), min_size=1, max_size=5, unique=True),

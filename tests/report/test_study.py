@@ -118,7 +118,7 @@ def test_every_task_has_a_main_cell(write_run: WriteRun, tmp_path: Path) -> None
     assert sum(not cell.variant for cell in study.cells) == 3
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.lists(st.tuples(*(st.integers(0, 2) for _ in range(4))), min_size=1, max_size=12))
 def test_whatever_was_run_a_task_has_a_main_cell(runs: list[tuple[int, int, int, int]]) -> None:
     made = []

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -38,8 +39,14 @@ PACKAGES = ("torch", "tensordict", "torchrl", "gymnasium", "mujoco", "numpy")
 def versions() -> dict[str, str]:
     """Versions of Python, the platform and the packages that a result depends on.
 
-    In a git checkout of this package the commit joins them, see :func:`commit`.
+    In a git checkout of this package the commit joins them, see :func:`commit`. They are looked up
+    once in a process, whose code stays what it was.
     """
+    return dict(_versions())
+
+
+@cache
+def _versions() -> dict[str, str]:
     found = {
         "python": platform.python_version(),
         "platform": platform.platform(),
