@@ -164,10 +164,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=has_none)
 
 
+def pytest_collectstart() -> None:
+    gc.disable()  # until all is loaded
+
+
 def pytest_collection_finish() -> None:
-    """Let the garbage collector leave alone what has been loaded: it stays to the end."""
+    """Let the garbage collector leave alone what has been loaded, since it stays to the end."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(10_000, 10, 10)
+    gc.enable()
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ import json
 import os
 import random
 import re
+import shutil
 import signal
 import time
 from collections.abc import Callable
@@ -16,6 +17,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 import torchrl_l1
+from tests.conftest import TINY
 from torchrl_l1.algorithms import METRPO, PETS
 from torchrl_l1.algorithms.outcomes import OUTCOME_METRICS
 from torchrl_l1.campaign.description import dump_yaml, read_campaign
@@ -46,6 +48,13 @@ MBMF_RUN = [
     *("shooting.candidates=16", "shooting.horizon=4", "model.hidden=[8]", "fit.max_epochs=20"),
     *("cloning.max_epochs=20", "fine_tuning.epochs=20", "wandb.mode=disabled"),
 ]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The directory of a tiny run that nothing has broken off."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    return run(compose("metrpo/inverted_pendulum", [*TINY, f"run_dir={folder}"]))
 
 
 def snapshot(folder: Path) -> dict[str, bytes]:
@@ -101,23 +110,21 @@ def test_foreign_directory_is_not_touched(tiny_recipe: Recipe, tmp_path: Path) -
 
 
 def test_run_killed_before_its_first_checkpoint_starts_over(
-    tiny_recipe: Recipe, tmp_path: Path
+    whole: Path, tiny_recipe: Recipe, tmp_path: Path
 ) -> None:
-    directory = run(tiny_recipe())
-    complete = (directory / "metrics.csv").read_text()
-    for file in directory.iterdir():
-        if file.name not in ("versions.json", ".lock"):
-            file.unlink()
+    directory = tmp_path / "run"
+    directory.mkdir()
+    for name in ("versions.json", ".lock"):
+        shutil.copy(whole / name, directory)
     assert run(tiny_recipe()) == directory
-    assert (directory / "metrics.csv").read_text() == complete
+    assert (directory / "metrics.csv").read_text() == (whole / "metrics.csv").read_text()
 
 
 @pytest.mark.parametrize("last", ["checkpoint.pt", "model.pt", "policy.pt", "timing.csv"])
 def test_kill_among_the_files_of_the_last_iteration_leaves_no_stale_ones(
-    last: str, tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    last: str, whole: Path, tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A kill right after each of them: the run is not finished, and all is right once it is."""
-    whole = run(tiny_recipe(f"run_dir={tmp_path / 'whole'}"))
     run(tiny_recipe("outer_iterations=1"))
     replace = os.replace
 
