@@ -124,8 +124,8 @@ def test_nothing_follows_a_termination_in_the_middle_of_the_data() -> None:
 
 
 def test_steps_that_did_not_happen_are_left_out() -> None:
-    policy, fine_tuning = make()
-    other, same = make()
+    policy, fine_tuning = make(epochs=2, value_epochs=2)
+    other, same = make(epochs=2, value_epochs=2)
     data = episodes(policy, 1.0, count=160)
     longer = torch.cat([data, data[:40]])
     longer["next", "reward"][160:] = 100.0
@@ -168,9 +168,9 @@ def test_rewards_that_are_not_finite_change_nothing() -> None:
 
 
 def test_resumed_rounds_repeat_the_unbroken_ones() -> None:
-    policy, fine_tuning = make()
+    policy, fine_tuning = make(epochs=2, value_epochs=2)
     fine_tuning.step(episodes(policy, 1.0))
-    copy, resumed = make()
+    copy, resumed = make(epochs=2, value_epochs=2)
     copy.load_state_dict(policy.state_dict())
     resumed.load_state_dict(deepcopy(fine_tuning.state_dict()))
     data = episodes(policy, 1.0)
