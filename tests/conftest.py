@@ -16,8 +16,6 @@ from typing import IO, Protocol
 import pytest
 from omegaconf import DictConfig
 
-from torchrl_l1.experiment.launch import compose
-
 TINY = [
     "outer_iterations=2",
     "episodes_per_iteration=2",
@@ -227,6 +225,7 @@ def tiny_overrides() -> list[str]:
 @pytest.fixture
 def tiny_recipe(tmp_path: Path) -> Callable[..., DictConfig]:
     """A composed recipe of the pendulum that runs in about a second into ``tmp_path / 'run'``."""
+    from torchrl_l1.experiment.launch import compose
 
     def make(*overrides: str, recipe: str = "metrpo/inverted_pendulum") -> DictConfig:
         return compose(recipe, [*TINY, f"run_dir={tmp_path / 'run'}", *overrides])
