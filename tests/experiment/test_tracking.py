@@ -226,7 +226,7 @@ def test_wandb_sync_makes_one_run_of_what_kills_and_evaluations_have_left(
         monkeypatch.delenv("WANDB_SERVICE", raising=False)  # the process of these tests
         files = map(str, run_dir.glob("wandb/offline-run-*"))
         command = [sys.executable, "-m", "wandb", "sync", *files]
-        done = subprocess.run(command, capture_output=True, text=True)
+        done = subprocess.run(command, capture_output=True, text=True, cwd=run_dir.parent)
         assert done.returncode == 0, done.stderr
     ((drawn, lines),) = server.history.items()
     assert drawn == known_id(run_dir)
