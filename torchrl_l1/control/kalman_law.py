@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl_l1.control import kalman
 from torchrl_l1.control.config import L1Config, Scalars
 from torchrl_l1.control.kalman import Posterior
-from torchrl_l1.control.least_squares import is_finite, whitened, without_effect
+from torchrl_l1.control.least_squares import any_of, is_finite, whitened, without_effect
 from torchrl_l1.control.signals import (
     Terms,
     credible,
@@ -238,8 +238,9 @@ def follow(
         estimated.residual,
         estimated.effect_matched,
         q,
-        u != unbounded,
-        invisible.any(-1, keepdim=True),
+        unbounded,
+        u,
+        any_of(invisible),
         non_finite,
         dtype,
         posterior,

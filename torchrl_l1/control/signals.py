@@ -124,7 +124,8 @@ class Terms(NamedTuple):
         estimate: the uncertainty estimate ``(..., n)``.
         effect_matched: its part that an action could cancel ``(..., n)``.
         q: next filter state ``(..., m)``.
-        cut: entries of the action that a bound cut ``(..., m)``, bool.
+        unbounded: the input before its bounds cut it ``(..., m)``.
+        u: the input ``(..., m)``.
         ill_conditioned: see :func:`~torchrl_l1.control.solve_matched`.
         non_finite: an input was not finite, or beyond belief ``(..., 1)``, bool.
         dtype: type of the state.
@@ -135,7 +136,8 @@ class Terms(NamedTuple):
     estimate: Tensor
     effect_matched: Tensor
     q: Tensor
-    cut: Tensor
+    unbounded: Tensor
+    u: Tensor
     ill_conditioned: Tensor
     non_finite: Tensor
     dtype: torch.dtype
@@ -149,11 +151,12 @@ def diagnose(
     affinization_error: Tensor | None = None,
 ) -> L1Diagnostics:
     """The diagnostics of a step, with those of the switching law if they are given."""
-    x_err, estimate, effect_matched, q, cut, ill_conditioned, non_finite, dtype, posterior = terms
+    x_err, estimate, effect_matched, q, unbounded, u, ill_conditioned, non_finite, dtype, _ = terms
     norms = torch.linalg.vector_norm(
         torch.stack([x_err, effect_matched, estimate - effect_matched], dim=-2), dim=-1
     )
-    prediction_error, matched, unmatched = norms.masked_fill(non_finite, 0.0).split(1, dim=-1)
+    norms = norms.masked_fill(non_finite, 0.0)
+    prediction_error, matched, unmatched = norms.split_with_sizes([1, 1, 1], -1)
     diagnostics = L1Diagnostics(
         switch=torch.zeros_like(non_finite) if switch is None else switch,
         affinization_error=(
@@ -165,12 +168,17 @@ def diagnose(
         matched=matched / config.dt,
         unmatched=unmatched / config.dt,
         u_a=torch.linalg.vector_norm(q, dim=-1, keepdim=True).clamp_max(torch.finfo(q.dtype).max),
-        saturation=(cut & ~non_finite).to(q.dtype).mean(-1, keepdim=True),
+        saturation=_share((unbounded != u).masked_fill(non_finite, False), q.dtype),
         ill_conditioned=ill_conditioned,
         non_finite=non_finite,
-        **_significance(posterior, prediction_error),
+        **_significance(terms.posterior, prediction_error),
     )
     return narrow_entries(diagnostics, dtype)
+
+
+def _share(flags: Tensor, dtype: torch.dtype) -> Tensor:
+    share = flags.to(dtype)
+    return share if flags.shape[-1] == 1 else share.mean(-1, keepdim=True)
 
 
 def _significance(posterior: Posterior | None, like: Tensor) -> dict[str, Tensor]:
