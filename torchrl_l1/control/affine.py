@@ -16,7 +16,14 @@ from torchrl_l1.control import kalman_law, law
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import ActionJacobian
 from torchrl_l1.control.probe import FORWARD_MODE
-from torchrl_l1.control.signals import diagnose, narrow, saturate, wide, wide_state
+from torchrl_l1.control.signals import (
+    ControlInput,
+    diagnose,
+    narrow,
+    saturate,
+    wide,
+    wide_state,
+)
 from torchrl_l1.control.state import L1Diagnostics, L1State
 
 BLOCK = 128
@@ -192,7 +199,7 @@ def augment_silently(
     fresh = ~state.started
     control = None
     if config.filter_input == "previous":  # which does not depend on the operating point
-        control = law.ControlInput.of(config, wide_state(state), wide(u_rl), fresh)
+        control = law.control_input(config, wide_state(state), wide(u_rl), fresh)
     tested = _tested_input(config, model, state, observation, u_rl, u_bar, control)
     switch, error, affinization = operating_point(
         model, observation, u_bar, u_rl, tested, state.started, config.epsilon
@@ -241,13 +248,14 @@ def _augment_kalman(
     # What the last step expected does not depend on where this one is.
     known = model.residual_statistics(observation, u_rl, "residuals")
     estimated = kalman_law.estimate(config, state, observation, known)
-    u = kalman_law.adapted(config, estimated, u_rl)
+    control = kalman_law.adapted(config, estimated, u_rl)
+    u = narrow(control.u, u_rl.dtype)
     u_bar, change, jacobian = affinize(model, observation, u)
     residuals = known
     if config.covariance != "residuals":
         residuals = model.residual_statistics(observation, u, config.covariance)
     u, following, terms = kalman_law.follow(
-        config, state, estimated, observation, u_rl, change, jacobian, u_bar, residuals
+        config, state, estimated, observation, u_rl, change, jacobian, u_bar, residuals, control
     )
     following = following._replace(
         u_bar=u_bar.masked_fill(terms.non_finite, 0.0), n_switch=state.n_switch + state.started
@@ -262,7 +270,7 @@ def _tested_input(
     observation: Tensor,
     u_rl: Tensor,
     u_bar: Tensor,
-    control: law.ControlInput | None,
+    control: ControlInput | None,
 ) -> Tensor:
     """The input at which the switching law tests the affine model ``(..., m)``."""
     if config.switch_on == "policy":

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
@@ -11,6 +9,7 @@ from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.kalman_law import estimate, follow
 from torchrl_l1.control.least_squares import any_of, solve_matched, whitened, without_effect
 from torchrl_l1.control.signals import (
+    ControlInput,
     Terms,
     credible,
     diagnose,
@@ -36,43 +35,23 @@ def filtered(config: L1Config, q: Tensor, sigma_m: Tensor) -> Tensor:
     return torch.lerp(q, sigma_m, config.filter_gain)
 
 
-class ControlInput(NamedTuple):
-    """What the control law makes of the policy's action.
+def control_input(
+    config: L1Config, state: L1State, u_rl: Tensor, fresh: Tensor, sigma_m: Tensor | None = None
+) -> ControlInput:
+    """The control law of arXiv 2403.14860, section 3.2.
 
-    Attributes:
-        q: next filter state ``(..., m)``.
-        unbounded: ``u_rl - q`` ``(..., m)``.
-        u: that within the bounds: the executed input ``(..., m)``.
+    Args:
+        config: the settings.
+        state: from the previous step.
+        u_rl: the policy's action within its bounds ``(..., m)``.
+        fresh: where the filter starts ``(..., 1)``, bool.
+        sigma_m: this step's estimate, for a filter that takes that in.
     """
-
-    q: Tensor
-    unbounded: Tensor
-    u: Tensor
-
-    @classmethod
-    def of(
-        cls,
-        config: L1Config,
-        state: L1State,
-        u_rl: Tensor,
-        fresh: Tensor,
-        sigma_m: Tensor | None = None,
-    ) -> ControlInput:
-        """The control law of arXiv 2403.14860, section 3.2.
-
-        Args:
-            config: the settings.
-            state: from the previous step.
-            u_rl: the policy's action within its bounds ``(..., m)``.
-            fresh: where the filter starts ``(..., 1)``, bool.
-            sigma_m: this step's estimate, for a filter that takes that in.
-        """
-        if sigma_m is None:
-            q = filtered(config, state.q, state.sigma_m).masked_fill(fresh, 0.0)
-        else:
-            q = filtered(config, state.q.masked_fill(fresh, 0.0), sigma_m)
-        unbounded = u_rl - q
-        return cls(q, unbounded, saturate(config, unbounded))
+    if sigma_m is None:
+        q = filtered(config, state.q, state.sigma_m).masked_fill(fresh, 0.0)
+    else:
+        q = filtered(config, state.q.masked_fill(fresh, 0.0), sigma_m)
+    return ControlInput.of(config, u_rl, q)
 
 
 def step(
@@ -217,8 +196,8 @@ def respond(
 
     if control is None:
         current = sigma_m if config.filter_input == "current" else None
-        control = ControlInput.of(config, state, u_rl, fresh, current)
-    q, unbounded, u = control
+        control = control_input(config, state, u_rl, fresh, current)
+    u = control.u
 
     # State predictor.
     step_u = u if u_bar is None else u - wide(u_bar)
@@ -232,13 +211,13 @@ def respond(
     following = L1State(
         x_hat=x_hat.masked_fill(non_finite, 0.0),
         u_bar=state.u_bar,
-        q=q,
+        q=control.q,
         sigma_m=sigma_m,
         n_switch=state.n_switch,
         started=finite,
     )
     terms = Terms(
-        x_err, estimate, effect_matched, q, unbounded, u, ill_conditioned, non_finite, dtype
+        x_err, estimate, effect_matched, control, ill_conditioned, non_finite, dtype
     )
     u = torch.where(finite, narrow(u, policy.dtype), policy)
     return u, narrow_entries(following, dtype), terms

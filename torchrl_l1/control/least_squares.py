@@ -57,8 +57,8 @@ def solve_matched(
 
     Returns:
         the solution ``(..., m)``, always finite, and flags ``(..., 1)``, true where a column is
-        ignored or the Jacobian is rank deficient, ill conditioned (see :data:`RANK_TOLERANCE`) or not finite.
-        A Jacobian or residual that is not finite gives zeros.
+        ignored or the Jacobian is rank deficient, ill conditioned (see :data:`RANK_TOLERANCE`) or
+        not finite. A Jacobian or residual that is not finite gives zeros.
 
     Examples:
         >>> jacobian = torch.tensor([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]])

@@ -116,6 +116,26 @@ def credible(config: L1Config, dtype: torch.dtype, x_err: Tensor, *states: Tenso
     return largest <= limit  # a comparison with what is not a number is false
 
 
+class ControlInput(NamedTuple):
+    """What an adaptive law makes of the policy's action.
+
+    Attributes:
+        q: what it takes away; the low-pass filter's next state ``(..., m)``.
+        unbounded: ``u_rl - q`` ``(..., m)``.
+        u: that within the bounds: the executed input ``(..., m)``.
+    """
+
+    q: Tensor
+    unbounded: Tensor
+    u: Tensor
+
+    @classmethod
+    def of(cls, config: L1Config, u_rl: Tensor, q: Tensor) -> ControlInput:
+        """The policy's action ``(..., m)`` less ``q``."""
+        unbounded = u_rl - q
+        return cls(q, unbounded, saturate(config, unbounded))
+
+
 class Terms(NamedTuple):
     """What of a step :func:`diagnose` makes its signals of, in state units per step.
 
@@ -123,9 +143,7 @@ class Terms(NamedTuple):
         x_err: state prediction error ``(..., n)``.
         estimate: the uncertainty estimate ``(..., n)``.
         effect_matched: its part that an action could cancel ``(..., n)``.
-        q: next filter state ``(..., m)``.
-        unbounded: the input before its bounds cut it ``(..., m)``.
-        u: the input ``(..., m)``.
+        control: the input.
         ill_conditioned: see :func:`~torchrl_l1.control.solve_matched`.
         non_finite: an input was not finite, or beyond belief ``(..., 1)``, bool.
         dtype: type of the state.
@@ -135,9 +153,7 @@ class Terms(NamedTuple):
     x_err: Tensor
     estimate: Tensor
     effect_matched: Tensor
-    q: Tensor
-    unbounded: Tensor
-    u: Tensor
+    control: ControlInput
     ill_conditioned: Tensor
     non_finite: Tensor
     dtype: torch.dtype
@@ -151,7 +167,8 @@ def diagnose(
     affinization_error: Tensor | None = None,
 ) -> L1Diagnostics:
     """The diagnostics of a step, with those of the switching law if they are given."""
-    x_err, estimate, effect_matched, q, unbounded, u, ill_conditioned, non_finite, dtype, _ = terms
+    x_err, estimate, effect_matched, (q, unbounded, u) = terms[:4]
+    ill_conditioned, non_finite, dtype, posterior = terms[4:]
     norms = torch.linalg.vector_norm(
         torch.stack([x_err, effect_matched, estimate - effect_matched], dim=-2), dim=-1
     )
@@ -171,7 +188,7 @@ def diagnose(
         saturation=_share((unbounded != u).masked_fill(non_finite, False), q.dtype),
         ill_conditioned=ill_conditioned,
         non_finite=non_finite,
-        **_significance(terms.posterior, prediction_error),
+        **_significance(posterior, prediction_error),
     )
     return narrow_entries(diagnostics, dtype)
 
