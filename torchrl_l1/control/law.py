@@ -216,9 +216,7 @@ def respond(
         n_switch=state.n_switch,
         started=finite,
     )
-    terms = Terms(
-        x_err, estimate, effect_matched, control, ill_conditioned, non_finite, dtype
-    )
+    terms = Terms(x_err, estimate, effect_matched, control, ill_conditioned, non_finite, dtype)
     u = torch.where(finite, narrow(u, policy.dtype), policy)
     return u, narrow_entries(following, dtype), terms
 
