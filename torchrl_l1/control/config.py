@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
-from functools import cached_property
 from typing import Any, Literal, get_args
 
 import torch
@@ -246,14 +245,14 @@ class L1Config:
         robust: dict[str, Any] = {"estimator": "weighted", "filter": "kalman"}
         return cls(dt, **(robust | settings))
 
-    @cached_property
+    @property
     def filter_gain(self) -> float:
         r"""Gain :math:`\alpha = \omega T_s` of the discrete low-pass filter."""
         if self.cutoff is not None:
             return self.cutoff * self.dt
         return DEFAULT_ALPHA if self.alpha is None else self.alpha
 
-    @cached_property
+    @property
     def matched_bound(self) -> Scalars | None:
         """Largest magnitude of the matched estimate that enters the filter, action units.
 
@@ -268,7 +267,7 @@ class L1Config:
         # The configuration expands a number beside a tuple, so both are numbers here.
         return _tuple(high)[0] - _tuple(low)[0]
 
-    @cached_property
+    @property
     def half_range(self) -> Scalars:
         """Half the range of the action, one where a bound is missing; action units."""
         if self.action_low is None or self.action_high is None:
@@ -277,7 +276,7 @@ class L1Config:
         halves = tuple(0.5 * (b - a) if math.isfinite(b - a) else 1.0 for a, b in pairs)
         return halves if isinstance(self.action_low, tuple) else halves[0]
 
-    @cached_property
+    @property
     def adaptation_gain(self) -> Scalars:
         r"""Diagonal of :math:`T_s \Phi^{-1} \exp(A_s T_s)`, dimensionless.
 
@@ -286,7 +285,7 @@ class L1Config:
         """
         return _map(lambda rate: _adaptation_gain(rate, self.dt), self.a_s)
 
-    @cached_property
+    @property
     def predictor_gain(self) -> Scalars:
         r"""Diagonal of what multiplies the prediction error in the predictor's step.
 
