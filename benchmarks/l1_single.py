@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import DoubleToFloat, GymEnv, TransformedEnv
+from torchrl.envs import DoubleToFloat, EnvBase, GymEnv, SerialEnv, TransformedEnv
 
 from benchmarks.tables import Table
 from benchmarks.timing import Row, interleave, spread, undisturbed_clock
-from torchrl_l1.control import L1Config, L1State, L1Transform, time_step, transform
-from torchrl_l1.control.seal import seal_width
+from torchrl_l1.control import L1Config, L1Transform, time_step
+from torchrl_l1.control.seal import SEAL, seal_width
 from torchrl_l1.dynamics import EnsembleDynamics
 
-TASKS = {"InvertedPendulum-v5": (4, 1), "HalfCheetah-v5": (17, 6)}
-"""Observations n and actions m of Gymnasium's environments."""
+TASKS = {
+    ("InvertedPendulum-v5", 1): (4, 1),
+    ("InvertedPendulum-v5", 25): (4, 1),
+    ("HalfCheetah-v5", 1): (17, 6),
+}
+"""Observations n and actions m of so many of Gymnasium's environments."""
 
 HIDDEN = (256, 256)
 THREADS = 1
@@ -25,11 +30,25 @@ THREADS = 1
 CASES: Mapping[str, Mapping[str, Any]] = {
     "alone": {},
     "paper": {"config": L1Config.paper},
-    "unsealed": {"config": L1Config.paper},
+    "unsealed": {"config": L1Config.paper, "check": False},
     "silent": {"config": L1Config.paper, "diagnostics": False},
     "robust": {"config": L1Config.robust},
 }
 """The environment alone, and with L1: as it is, without seals, without diagnostics; robust."""
+
+PAIRS = 10
+"""The share of the seals is small: it is the median of so many times as many short measurements."""
+
+
+class Unsealed(L1Transform):
+    """L1 with seals that are zero, and not looked at."""
+
+    def _seal(self, nested: TensorDictBase, observation: Tensor) -> None:
+        nested.set(SEAL, observation.new_zeros(()).expand(*nested.shape, seal_width(self._width)))
+
+    @property
+    def _width(self) -> int:
+        return self._resolve().observation_dim
 
 
 @torch.no_grad()
@@ -44,13 +63,18 @@ def run(repetitions: int) -> list[Row]:
         ``seal_share`` is that of the seals in a step with L1.
     """
     rows: list[Row] = []
-    for task, (n, m) in TASKS.items():
-        steps = {name: _stepper(task, n, m, name == "unsealed", **CASES[name]) for name in CASES}
+    for (task, count), (n, m) in TASKS.items():
+        torch.manual_seed(0)
+        model = EnsembleDynamics(n, m, hidden=HIDDEN).eval()
+        steps = {name: _stepper(task, count, model, **CASES[name]) for name in CASES}
         seconds = interleave(steps, repetitions, shortest=0.2, clock=undisturbed_clock())
-        row: Row = {"task": task, **spread("alone", [1e6 * value for value in seconds["alone"]])}
+        row: Row = {"task": task, "num_envs": count}
+        row |= spread("alone", [1e6 * value for value in seconds["alone"]])
         for name in list(CASES)[1:]:
             pairs = zip(seconds[name], seconds["alone"], strict=True)
             row |= spread(name, [1e6 * (with_l1 - alone) for with_l1, alone in pairs])
+        both = {name: steps[name] for name in ("paper", "unsealed")}
+        seconds = interleave(both, PAIRS * repetitions, clock=undisturbed_clock())
         pairs = zip(seconds["paper"], seconds["unsealed"], strict=True)
         row |= spread("seal_share", [1 - without / sealed for sealed, without in pairs])
         rows.append(row)
@@ -59,52 +83,30 @@ def run(repetitions: int) -> list[Row]:
 
 def _stepper(
     task: str,
-    n: int,
-    m: int,
-    unsealed: bool,
+    count: int,
+    model: EnsembleDynamics,
     config: Callable[[float], L1Config] | None = None,
+    check: bool = True,
     **options: Any,
 ) -> Callable[[], None]:
-    """One step after the other of one environment, by a policy that costs nothing."""
-    torch.manual_seed(0)
-    env = TransformedEnv(GymEnv(task), DoubleToFloat(in_keys=["observation"]))
+    """One step after the other, by a policy that costs nothing."""
+    make = partial(GymEnv, task)
+    base: EnvBase = make() if count == 1 else SerialEnv(count, make)
+    env = TransformedEnv(base, DoubleToFloat(in_keys=["observation"]))
     if config is not None:
-        model = EnsembleDynamics(n, m, hidden=HIDDEN).eval()
-        dt = time_step(GymEnv(task))
+        dt = time_step(make())
         assert dt is not None
-        env.append_transform(L1Transform(model, config(dt), check=not unsealed, **options))
+        kind = L1Transform if check else Unsealed
+        env.append_transform(kind(model, config(dt), check=check, **options))
     env.set_seed(0)
-    data, action = env.reset(), torch.zeros(m)
+    data, action = env.reset(), torch.zeros(*env.batch_size, model.action_dim)
 
     def step() -> None:
         nonlocal data
         data.set("action", action)
         _, data = env.step_and_maybe_reset(data)
 
-    def without_seals() -> None:
-        with _without_seals():
-            step()
-
-    return without_seals if unsealed else step
-
-
-@contextmanager
-def _without_seals() -> Iterator[None]:
-    """What :func:`~torchrl_l1.control.seal.sealed` computes is zero meanwhile."""
-    own = transform.sealed
-    nothing: dict[int, Tensor] = {}
-
-    def constant(observation: Tensor, state: L1State) -> Tensor:
-        width = observation.shape[-1]
-        if width not in nothing:
-            nothing[width] = torch.zeros(seal_width(width))
-        return nothing[width]
-
-    transform.sealed = constant
-    try:
-        yield
-    finally:
-        transform.sealed = own
+    return step
 
 
 def table(repetitions: int) -> Table:
@@ -113,12 +115,13 @@ def table(repetitions: int) -> Table:
         "l1_single",
         "L1 around a single environment",
         "Microseconds of a step with all that TorchRL does around it, median (range): of "
-        "Gymnasium's environment alone, and what L1 adds, for five members of 2 x 256 ReLU units: "
+        "Gymnasium's environments alone, and what L1 adds, for five members of 2 x 256 ReLU units: "
         "the paper's controller, the same without seals and without diagnostics, and the robust "
         "one. Last the share of the seals in a step with L1.",
         run(repetitions),
         {
             "task": "environment",
+            "num_envs": "environments",
             "alone": "alone",
             "paper": "paper",
             "unsealed": "without seals",

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import csv
+import importlib
 import importlib.util
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -36,6 +39,25 @@ def rows(text: str) -> list[dict[str, str]]:
 def overall() -> dict[str, dict[str, str]]:
     """What is recovered, by task, as the script wrote it."""
     return {row["task"]: row for row in rows((RESULTS / "robust/overall.md").read_text())}
+
+
+def imported(file: Path) -> Iterator[tuple[str, str]]:
+    """Modules of the package that a script imports, and what it takes from them."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("torchrl_l1"):
+            yield from ((node.module, alias.name) for alias in node.names)
+
+
+def test_scripts_of_the_documentation_find_what_they_import() -> None:
+    missing = []
+    for file in sorted((ROOT / "docs").rglob("*.py")):
+        for module, name in imported(file):
+            if not hasattr(importlib.import_module(module), name):
+                try:  # a module of the package
+                    importlib.import_module(f"{module}.{name}")
+                except ModuleNotFoundError:
+                    missing.append(f"{file.name}: {module}.{name}")
+    assert not missing
 
 
 def section(page: str, heading: str) -> str:

@@ -280,14 +280,14 @@ def draw(rows: Sequence[Row], file: Path) -> None:
         for arm, marker in zip(ARMS, "ox", strict=True):
             x = [float(row[measure]) for row in of_plant]
             y = [max(-1.0, float(row[arm])) for row in of_plant]
-            axis.plot(x, y, marker, color=color(1, arm), label=f"L1 {arm}", ms=4, alpha=0.7)
+            axis.plot(x, y, marker, color=color(1 + ARMS.index(arm)), label=f"L1 {arm}", ms=4)
         if measure == "explained_mean":
             axis.set_xlim(-1, 1.05)
         else:
             axis.set_xscale("log")
         axis.axhline(0, color="0.6", lw=0.8)
         axis.set_title(plant, fontsize=9)
-        axis.set_xlabel(MEASURES[measure], fontsize=8)
+        axis.set_xlabel(MEASURES[measure].split(",")[0], fontsize=8)
         axis.set_ylabel("share regained", fontsize=8)
     legend_below(figure, axes)
     save(figure, file)

@@ -25,7 +25,7 @@ import numpy as np
 import torch
 
 from torchrl_l1.cli import main
-from torchrl_l1.experiment.run_directory import write_table
+from torchrl_l1.experiment.files import write_table
 from torchrl_l1.report.page import markdown
 
 HERE = Path(__file__).with_name("robustify")

@@ -44,11 +44,9 @@ def test_controllers_have_a_row_per_task_and_size(monkeypatch: pytest.MonkeyPatc
 def test_a_single_environment_is_measured_with_and_without_seals(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(l1_single, "TASKS", {"InvertedPendulum-v5": (4, 1)})
+    monkeypatch.setattr(l1_single, "TASKS", {("InvertedPendulum-v5", 2): (4, 1)})
     monkeypatch.setattr(l1_single, "HIDDEN", (8,))
-    before = l1_single.transform.sealed
     table = l1_single.table(1)
-    assert l1_single.transform.sealed is before
     (row,) = table.rows
     assert set(table.columns) <= set(row)
     assert float(row["paper"]) > 0 and float(row["seal_share"]) < 1

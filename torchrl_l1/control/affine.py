@@ -16,7 +16,14 @@ from torchrl_l1.control import kalman_law, law
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import ActionJacobian
 from torchrl_l1.control.probe import FORWARD_MODE
-from torchrl_l1.control.signals import diagnose, saturate
+from torchrl_l1.control.signals import (
+    ControlInput,
+    diagnose,
+    narrow,
+    saturate,
+    wide,
+    wide_state,
+)
 from torchrl_l1.control.state import L1Diagnostics, L1State
 
 BLOCK = 128
@@ -189,26 +196,41 @@ def augment_silently(
         return _augment_kalman(config, model, state, observation, u_rl)
     u_rl = saturate(config, u_rl)
     u_bar = torch.where(state.started, state.u_bar, u_rl)
-    tested = _tested_input(config, model, state, observation, u_rl, u_bar)
+    fresh = ~state.started
+    control = None
+    if config.filter_input == "previous":  # which does not depend on the operating point
+        control = law.control_input(config, wide_state(state), wide(u_rl), fresh)
+    tested = _tested_input(config, model, state, observation, u_rl, u_bar, control)
     switch, error, affinization = operating_point(
         model, observation, u_bar, u_rl, tested, state.started, config.epsilon
     )
     u_bar, change, jacobian = affinization
     # A prediction that is not finite at the tested input counts like one at the operating point.
-    change = torch.where(state.started & ~error.isfinite(), torch.nan, change)
-    restart = switch if config.on_switch == "reset" else None
-    residuals = None
+    believed = (error < torch.inf) | fresh
+    restart = residuals = None
+    if config.on_switch == "reset":
+        restart, control = switch, None
     if config.estimator == "weighted":
         residuals = model.residual_statistics(observation, u_bar, config.covariance)
     u, following, terms = law.respond(
-        config, state, observation, u_rl, change, jacobian, u_bar, restart, residuals
+        config,
+        state,
+        observation,
+        u_rl,
+        change,
+        jacobian,
+        u_bar,
+        restart,
+        residuals,
+        control,
+        believed,
     )
     following = following._replace(
         u_bar=u_bar.masked_fill(terms.non_finite, 0.0), n_switch=state.n_switch + switch
     )
 
     def diagnostics() -> L1Diagnostics:
-        counted = error.masked_fill(terms.non_finite | ~state.started, 0.0)
+        counted = error.masked_fill(terms.non_finite | fresh, 0.0)
         return diagnose(config, terms, switch, counted)
 
     return u, following, diagnostics
@@ -226,13 +248,14 @@ def _augment_kalman(
     # What the last step expected does not depend on where this one is.
     known = model.residual_statistics(observation, u_rl, "residuals")
     estimated = kalman_law.estimate(config, state, observation, known)
-    u = kalman_law.adapted(config, estimated, u_rl)
+    control = kalman_law.adapted(config, estimated, u_rl)
+    u = narrow(control.u, u_rl.dtype)
     u_bar, change, jacobian = affinize(model, observation, u)
     residuals = known
     if config.covariance != "residuals":
         residuals = model.residual_statistics(observation, u, config.covariance)
     u, following, terms = kalman_law.follow(
-        config, state, estimated, observation, u_rl, change, jacobian, u_bar, residuals
+        config, state, estimated, observation, u_rl, change, jacobian, u_bar, residuals, control
     )
     following = following._replace(
         u_bar=u_bar.masked_fill(terms.non_finite, 0.0), n_switch=state.n_switch + state.started
@@ -247,17 +270,16 @@ def _tested_input(
     observation: Tensor,
     u_rl: Tensor,
     u_bar: Tensor,
+    control: ControlInput | None,
 ) -> Tensor:
     """The input at which the switching law tests the affine model ``(..., m)``."""
     if config.switch_on == "policy":
         return u_rl
-    if config.filter_input == "current":
+    if control is None:
         # The executed input depends on the Jacobian, through this step's estimate.
         change, jacobian = model.value_and_jacobian(observation, u_bar)
         return law.respond(config, state, observation, u_rl, change, jacobian, u_bar)[0]
-    # It does not depend on the operating point: the filter's next state is known.
-    adapted = saturate(config, u_rl - law.filtered(config, state.q, state.sigma_m))
-    return torch.where(state.started, adapted, u_rl)
+    return narrow(control.u, u_rl.dtype)
 
 
 def make_step(

@@ -35,7 +35,14 @@ def time_update(covariance: Tensor, process_noise: Tensor | float) -> Tensor:
     return covariance + torch.diag_embed(variance)
 
 
-def measurement_update(prior: Posterior, jacobian: Tensor, innovation: Tensor) -> Posterior:
+def factor(covariance: Tensor) -> Tensor:
+    r"""Cholesky factor :math:`L` of a covariance ``(..., m, m)``."""
+    return torch.linalg.cholesky_ex(_bolstered(covariance))[0]
+
+
+def measurement_update(
+    prior: Posterior, jacobian: Tensor, innovation: Tensor, root: Tensor | None = None
+) -> Posterior:
     r"""Condition the disturbance on ``innovation = jacobian (d - mean) + white noise``.
 
     With :math:`P = L L^\top`, white measurements of unit variance and
@@ -47,6 +54,7 @@ def measurement_update(prior: Posterior, jacobian: Tensor, innovation: Tensor) -
         prior: mean and positive definite covariance.
         jacobian: whitened input matrix ``(..., n, m)``.
         innovation: whitened residual less what the prior expects ``(..., n)``.
+        root: :func:`factor` of the prior's covariance, if known.
 
     Returns:
         the posterior.
@@ -56,11 +64,11 @@ def measurement_update(prior: Posterior, jacobian: Tensor, innovation: Tensor) -
         >>> measurement_update(prior, torch.ones(1, 1), torch.ones(1))
         Posterior(mean=tensor([0.5000]), covariance=tensor([[0.5000]]))
     """
-    factor = torch.linalg.cholesky_ex(_bolstered(prior.covariance))[0]
-    seen = jacobian @ factor
-    eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
+    root = factor(prior.covariance) if root is None else root
+    seen = jacobian @ root
+    eye = torch.eye(root.shape[-1], dtype=root.dtype, device=root.device)
     inner = torch.linalg.cholesky_ex(eye + seen.mT @ seen)[0]
-    half = torch.linalg.solve_triangular(inner, factor.mT, upper=False)
+    half = torch.linalg.solve_triangular(inner, root.mT, upper=False)
     covariance = half.mT @ half
     score = jacobian.mT @ innovation.unsqueeze(-1)
     return Posterior(prior.mean + (covariance @ score).squeeze(-1), covariance)

@@ -10,8 +10,9 @@ from torch import Tensor
 from torchrl_l1.control import kalman
 from torchrl_l1.control.config import L1Config, Scalars
 from torchrl_l1.control.kalman import Posterior
-from torchrl_l1.control.least_squares import is_finite, whitened, without_effect
+from torchrl_l1.control.least_squares import any_of, is_finite, whitened, without_effect
 from torchrl_l1.control.signals import (
+    ControlInput,
     Terms,
     credible,
     like,
@@ -69,15 +70,14 @@ class Reach(NamedTuple):
     def of(cls, config: L1Config, executed: Tensor, posterior: Posterior) -> Reach:
         """For an executed input ``(..., m)`` and what is known of the disturbance."""
         mean = posterior.mean
-        passed = saturate(config, executed + mean) - executed
+        both = executed + mean
+        passed = saturate(config, both) - executed
         # No smaller than rounding: actions without bounds may be large.
-        rounding = 64 * torch.finfo(mean.dtype).eps * (executed + mean).abs()
+        rounding = 64 * torch.finfo(mean.dtype).eps * both.abs()
         margin = 1e-3 * like(mean, config.half_range) + rounding
-        above, below = (
-            saturate(config, executed + mean + sign * margin) - executed for sign in (1, -1)
-        )
         # Rounding may take some of twice the margin, a bound takes at least half.
-        within = above - below > 1.5 * margin
+        span = saturate(config, both + margin) - saturate(config, both - margin)
+        within = span > 1.5 * margin
         variance = posterior.covariance.diagonal(dim1=-2, dim2=-1) + (mean - passed).square()
         return cls(passed, within, variance.sqrt().masked_fill(within, 0.0))
 
@@ -153,11 +153,13 @@ def estimate(
         covariance + unknown @ unknown.mT, jacobian / scale, innovation.unsqueeze(-1) / scale
     )
     white = white.squeeze(-1)
-    posterior = kalman.measurement_update(prior, columns, white)
+    factor = kalman.factor(prior.covariance)
+    posterior = kalman.measurement_update(prior, columns, white, factor)
     if config.forgetting < 1:
         # A residual far beyond what is expected counts for as much less, at once.
         doubt = kalman.doubt(columns, white, posterior.mean - prior.mean).sqrt()
-        posterior = kalman.measurement_update(prior, columns / doubt.unsqueeze(-1), white / doubt)
+        columns, white = columns / doubt.unsqueeze(-1), white / doubt
+        posterior = kalman.measurement_update(prior, columns, white, factor)
         left = residual - (jacobian @ posterior.mean.unsqueeze(-1)).squeeze(-1)
         ratio = kalman.noise_ratio(covariance, jacobian, posterior, left, unknown * scale)
         noise = torch.where(fresh, noise, torch.lerp(ratio, noise, config.forgetting))
@@ -172,10 +174,10 @@ def estimate(
     return Estimate(posterior, noise, innovation, residual, effect, finite)
 
 
-def adapted(config: L1Config, estimated: Estimate, u_rl: Tensor) -> Tensor:
+def adapted(config: L1Config, estimated: Estimate, u_rl: Tensor) -> ControlInput:
     """The input that cancels what of an estimate is significant, within the bounds."""
     q = kalman.significant(estimated.posterior, config.dead_zone)
-    return narrow(saturate(config, wide(u_rl) - q), u_rl.dtype)
+    return ControlInput.of(config, wide(u_rl), q)
 
 
 def follow(
@@ -188,6 +190,7 @@ def follow(
     jacobian: Tensor,
     u_bar: Tensor | None = None,
     residuals: ResidualStatistics | None = None,
+    control: ControlInput | None = None,
 ) -> tuple[Tensor, L1State, Terms]:
     """The input, the next state and the terms of the diagnostics after :func:`estimate`.
 
@@ -201,6 +204,7 @@ def follow(
         jacobian: as in :func:`step`.
         u_bar: operating point ``(..., m)``; zero if ``None``.
         residuals: as in :func:`step`, at this step's input where they depend on it.
+        control: what :func:`adapted` gave, where that is known already.
 
     Returns:
         as :func:`respond`.
@@ -208,10 +212,10 @@ def follow(
     dtype, policy = state.x_hat.dtype, u_rl
     observation, u_rl, change, jacobian = map(wide, (observation, u_rl, change, jacobian))
     posterior = estimated.posterior
-    q = kalman.significant(posterior, config.dead_zone)
-    unbounded = u_rl - q
-    u = saturate(config, unbounded)
-    step_u = (u if u_bar is None else u - wide(u_bar)) + Reach.of(config, u, posterior).passed
+    control = adapted(config, estimated, u_rl) if control is None else control
+    u = control.u
+    passed = saturate(config, u + posterior.mean) - u  # see Reach
+    step_u = (u if u_bar is None else u - wide(u_bar)) + passed
     x_hat = observation + change + (jacobian @ step_u.unsqueeze(-1)).squeeze(-1)
 
     finite = estimated.finite & is_finite(jacobian.flatten(-2))
@@ -224,7 +228,7 @@ def follow(
     following = L1State(
         x_hat=x_hat.masked_fill(non_finite, 0.0),
         u_bar=u.masked_fill(non_finite, 0.0),
-        q=q,
+        q=control.q,
         sigma_m=posterior.mean,
         n_switch=state.n_switch,
         started=finite,
@@ -237,9 +241,8 @@ def follow(
         -estimated.innovation,
         estimated.residual,
         estimated.effect_matched,
-        q,
-        u != unbounded,
-        invisible.any(-1, keepdim=True),
+        control,
+        any_of(invisible),
         non_finite,
         dtype,
         posterior,

@@ -7,8 +7,9 @@ from torch import Tensor
 
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.kalman_law import estimate, follow
-from torchrl_l1.control.least_squares import solve_matched, whitened, without_effect
+from torchrl_l1.control.least_squares import any_of, solve_matched, whitened, without_effect
 from torchrl_l1.control.signals import (
+    ControlInput,
     Terms,
     credible,
     diagnose,
@@ -32,6 +33,25 @@ def filtered(config: L1Config, q: Tensor, sigma_m: Tensor) -> Tensor:
     This is arXiv 2403.14860, control law of section 3.2, with :math:`K = \omega I`.
     """
     return torch.lerp(q, sigma_m, config.filter_gain)
+
+
+def control_input(
+    config: L1Config, state: L1State, u_rl: Tensor, fresh: Tensor, sigma_m: Tensor | None = None
+) -> ControlInput:
+    """The control law of arXiv 2403.14860, section 3.2.
+
+    Args:
+        config: the settings.
+        state: from the previous step.
+        u_rl: the policy's action within its bounds ``(..., m)``.
+        fresh: where the filter starts ``(..., 1)``, bool.
+        sigma_m: this step's estimate, for a filter that takes that in.
+    """
+    if sigma_m is None:
+        q = filtered(config, state.q, state.sigma_m).masked_fill(fresh, 0.0)
+    else:
+        q = filtered(config, state.q.masked_fill(fresh, 0.0), sigma_m)
+    return ControlInput.of(config, u_rl, q)
 
 
 def step(
@@ -126,6 +146,8 @@ def respond(
     u_bar: Tensor | None = None,
     restart: Tensor | None = None,
     residuals: ResidualStatistics | None = None,
+    control: ControlInput | None = None,
+    believed: Tensor | None = None,
 ) -> tuple[Tensor, L1State, Terms]:
     """:func:`step` without its diagnostics, on ``x' = x + change + jacobian (u - u_bar)``.
 
@@ -139,6 +161,8 @@ def respond(
         u_bar: operating point ``(..., m)``; zero if ``None``.
         restart: as in :func:`step`.
         residuals: as in :func:`step`.
+        control: the input, where it does not depend on this step's estimate and is known already.
+        believed: ``(..., 1)`` bool, false where the model is not finite at another input.
 
     Returns:
         the executed input, the next state (but for what a switch changes) and what
@@ -157,50 +181,52 @@ def respond(
     estimate = x_err * -like(x_err, config.adaptation_gain)
     reach = like(x_err, config.half_range)
     invisible = without_effect(jacobian, torch.maximum(observation.abs(), x_hat.abs()), reach)
-    # A product keeps the strides of the Jacobian, on which the rounding of what follows depends.
-    columns, residual = jacobian * ~invisible.unsqueeze(-2), estimate
+    columns, residual = jacobian, estimate
     if config.estimator == "weighted" and residuals is not None:
         covariance = wide(residuals.covariance)
-        columns, white = whitened(covariance, columns, estimate.unsqueeze(-1))
+        columns, white = whitened(covariance, jacobian, estimate.unsqueeze(-1))
         residual = white.squeeze(-1)
-    matched, ill_conditioned = solve_matched(columns, residual)
-    ill_conditioned = ill_conditioned | invisible.any(-1, keepdim=True)
+    matched, ill_conditioned = solve_matched(columns, residual, invisible)
     if config.matched_bound is not None:
         # What a million times the actions' range would explain is not matched.
-        absurd = (matched.abs() > _ABSURD * reach).any(-1, keepdim=True)
+        absurd = any_of(matched.abs() > _ABSURD * reach)
         matched = matched.masked_fill(absurd, 0.0)
         ill_conditioned = ill_conditioned | absurd
     sigma_m = project(config, matched)
 
-    # Control input.
-    if config.filter_input == "previous":
-        q = filtered(config, state.q, state.sigma_m).masked_fill(fresh, 0.0)
-    else:
-        q = filtered(config, state.q.masked_fill(fresh, 0.0), sigma_m)
-    unbounded = u_rl - q
-    u = saturate(config, unbounded)
+    if control is None:
+        current = sigma_m if config.filter_input == "current" else None
+        control = control_input(config, state, u_rl, fresh, current)
+    u = control.u
 
     # State predictor.
     step_u = u if u_bar is None else u - wide(u_bar)
-    effect_u, effect_matched = (jacobian @ torch.stack([step_u, matched], dim=-1)).unbind(-1)
+    effect_u, effect_matched = _effects(jacobian, step_u, matched)
     x_hat = x_hat + change + effect_u - x_err * like(x_err, config.predictor_gain)
 
     finite = credible(config, dtype, x_err, observation, x_hat)
+    finite = finite if believed is None else finite & believed
     non_finite = ~finite
     # The least squares gives finite numbers whatever it gets, so q and sigma_m need no care.
     following = L1State(
         x_hat=x_hat.masked_fill(non_finite, 0.0),
         u_bar=state.u_bar,
-        q=q,
+        q=control.q,
         sigma_m=sigma_m,
         n_switch=state.n_switch,
         started=finite,
     )
-    terms = Terms(
-        x_err, estimate, effect_matched, q, u != unbounded, ill_conditioned, non_finite, dtype
-    )
+    terms = Terms(x_err, estimate, effect_matched, control, ill_conditioned, non_finite, dtype)
     u = torch.where(finite, narrow(u, policy.dtype), policy)
     return u, narrow_entries(following, dtype), terms
+
+
+def _effects(jacobian: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
+    """What inputs ``(..., m)`` do to the state: ``(..., n)`` each."""
+    if jacobian.shape[-1] == 1:  # the same, without a product of matrices
+        column = jacobian.squeeze(-1)
+        return tuple(column * each for each in inputs)
+    return (jacobian @ torch.stack(inputs, dim=-1)).unbind(-1)
 
 
 def _check_shapes(

@@ -41,7 +41,9 @@ action without effect is flagged instead of being given an enormous estimate.
 """
 
 
-def solve_matched(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+def solve_matched(
+    jacobian: Tensor, residual: Tensor, ignored: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     r"""Least-squares solution of ``jacobian @ x = residual``, damped where that is ill posed.
 
     Column-equilibrated normal equations by Cholesky decomposition: for tall, thin Jacobians
@@ -51,11 +53,12 @@ def solve_matched(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
     Args:
         jacobian: ``(..., n, m)``.
         residual: ``(..., n)``.
+        ignored: columns that count as zero ``(..., m)``, bool; none if ``None``.
 
     Returns:
-        the solution ``(..., m)``, always finite, and flags ``(..., 1)``, true where the
-        Jacobian is rank deficient, ill conditioned (see :data:`RANK_TOLERANCE`) or not finite.
-        A Jacobian or residual that is not finite gives zeros.
+        the solution ``(..., m)``, always finite, and flags ``(..., 1)``, true where a column is
+        ignored or the Jacobian is rank deficient, ill conditioned (see :data:`RANK_TOLERANCE`) or
+        not finite. A Jacobian or residual that is not finite gives zeros.
 
     Examples:
         >>> jacobian = torch.tensor([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]])
@@ -65,12 +68,16 @@ def solve_matched(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
     """
     dtype = jacobian.dtype
     if dtype not in EFFECT_TOLERANCE:  # the products of half-precision columns overflow
-        solution, ill_conditioned = solve_matched(jacobian.float(), residual.float())
+        solution, ill_conditioned = solve_matched(jacobian.float(), residual.float(), ignored)
         return solution.to(dtype), ill_conditioned
     if jacobian.shape[-1] == 1:
-        solution, ill_conditioned = _solve_one_column(jacobian, residual)
-        return torch.where(solution.isfinite(), solution, 0.0), ill_conditioned
+        return _solve_one_column(jacobian, residual, ignored)
+    if ignored is not None:
+        # A product keeps the strides of the Jacobian, on which rounding depends.
+        jacobian = jacobian * ~ignored.unsqueeze(-2)
     solution, ill_conditioned = _solve_columns(jacobian, residual)
+    if ignored is not None:
+        ill_conditioned = ill_conditioned | any_of(ignored)
     return solution.masked_fill(~is_finite(solution), 0.0), ill_conditioned
 
 
@@ -96,13 +103,23 @@ def without_effect(jacobian: Tensor, size: Tensor, reach: Tensor | float) -> Ten
     return effect < EFFECT_TOLERANCE[jacobian.dtype] / reach
 
 
-def _solve_one_column(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+def any_of(flags: Tensor) -> Tensor:
+    """Whether any flag is set: ``(..., d)`` to ``(..., 1)``; of one it is that flag."""
+    return flags if flags.shape[-1] == 1 else flags.any(-1, keepdim=True)
+
+
+def _solve_one_column(
+    jacobian: Tensor, residual: Tensor, ignored: Tensor | None
+) -> tuple[Tensor, Tensor]:
     column = jacobian.squeeze(-1)
     square = column.square().sum(-1, keepdim=True)
     # A comparison with what is not a number is false.
     usable = (square > torch.finfo(square.dtype).tiny) & (square < torch.inf)
+    usable = usable if ignored is None else usable & ~ignored
+    unusable = ~usable
     projection = (column * residual).sum(-1, keepdim=True)
-    return projection / torch.where(usable, square, torch.inf), ~usable
+    solution = projection / square.masked_fill(unusable, torch.inf)
+    return solution.nan_to_num(0.0, 0.0, 0.0), unusable
 
 
 def _solve_columns(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:

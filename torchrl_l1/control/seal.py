@@ -33,7 +33,6 @@ def seal_width(observation_dim: int) -> int:
     return observation_dim + _EXTRA
 
 
-@torch.no_grad()
 def sealed(observation: Tensor, state: L1State) -> Tensor:
     """Observation, flags and sums of the state ``(..., n + 4)``, in the state's type.
 
@@ -41,17 +40,18 @@ def sealed(observation: Tensor, state: L1State) -> Tensor:
     entries in action units and of all others are kept apart, so that large observations do not
     hide changes of small actions.
     """
-    _, _, _, _, n_switch, started, *memory = state
-    in_action_units = torch.cat([getattr(state, name) for name in _IN_ACTION_UNITS], -1)
-    others = [state.x_hat, *(value for value in memory if value is not None)]
-    others_sum = (torch.cat(others, -1) if len(others) > 1 else others[0]).sum(-1, keepdim=True)
-    actions_sum = in_action_units.sum(-1, keepdim=True)
+    # Every operation counts here: at a batch of one each costs as much as a thousand sums.
+    x_hat, u_bar, q, sigma_m, n_switch, started, *memory = state
+    others = x_hat
+    if memory[0] is not None:
+        others = torch.cat([x_hat, *(value for value in memory if value is not None)], -1)
+    others_sum = others.sum(-1, keepdim=True)
+    actions_sum = torch.cat([u_bar, q, sigma_m], -1).sum(-1, keepdim=True)
     # What is not finite is a number of its own here: whoever looks at the entries finds none.
-    dtype = state.x_hat.dtype
+    dtype = x_hat.dtype
     largest = min(torch.finfo(dtype).max, _LARGEST)
     observation = observation.to(dtype).nan_to_num(0.9 * largest, largest, -largest)
-    parts = [observation, started, n_switch, actions_sum, others_sum]
-    return torch.cat(parts, -1)
+    return torch.cat([observation, started, n_switch, actions_sum, others_sum], -1).detach()
 
 
 class Emitted(NamedTuple):
@@ -194,10 +194,10 @@ def _lost(state: L1State | None, emitted: Emitted | None) -> list[str]:
 
 
 def _versions(observation: Tensor, state: L1State) -> tuple[int, ...] | None:
-    tensors = [observation, *(value for value in state if value is not None)]
-    if any(tensor.is_inference() for tensor in tensors):
+    try:
+        return observation._version, *[value._version for value in state if value is not None]
+    except RuntimeError:  # tensors of inference mode do not count
         return None
-    return tuple(tensor._version for tensor in tensors)
 
 
 # Opaque to the compiler, which would break its graph at a question that depends on data.

@@ -116,6 +116,26 @@ def credible(config: L1Config, dtype: torch.dtype, x_err: Tensor, *states: Tenso
     return largest <= limit  # a comparison with what is not a number is false
 
 
+class ControlInput(NamedTuple):
+    """What an adaptive law makes of the policy's action.
+
+    Attributes:
+        q: what it takes away; the low-pass filter's next state ``(..., m)``.
+        unbounded: ``u_rl - q`` ``(..., m)``.
+        u: that within the bounds: the executed input ``(..., m)``.
+    """
+
+    q: Tensor
+    unbounded: Tensor
+    u: Tensor
+
+    @classmethod
+    def of(cls, config: L1Config, u_rl: Tensor, q: Tensor) -> ControlInput:
+        """The policy's action ``(..., m)`` less ``q``."""
+        unbounded = u_rl - q
+        return cls(q, unbounded, saturate(config, unbounded))
+
+
 class Terms(NamedTuple):
     """What of a step :func:`diagnose` makes its signals of, in state units per step.
 
@@ -123,8 +143,7 @@ class Terms(NamedTuple):
         x_err: state prediction error ``(..., n)``.
         estimate: the uncertainty estimate ``(..., n)``.
         effect_matched: its part that an action could cancel ``(..., n)``.
-        q: next filter state ``(..., m)``.
-        cut: entries of the action that a bound cut ``(..., m)``, bool.
+        control: the input.
         ill_conditioned: see :func:`~torchrl_l1.control.solve_matched`.
         non_finite: an input was not finite, or beyond belief ``(..., 1)``, bool.
         dtype: type of the state.
@@ -134,8 +153,7 @@ class Terms(NamedTuple):
     x_err: Tensor
     estimate: Tensor
     effect_matched: Tensor
-    q: Tensor
-    cut: Tensor
+    control: ControlInput
     ill_conditioned: Tensor
     non_finite: Tensor
     dtype: torch.dtype
@@ -149,11 +167,13 @@ def diagnose(
     affinization_error: Tensor | None = None,
 ) -> L1Diagnostics:
     """The diagnostics of a step, with those of the switching law if they are given."""
-    x_err, estimate, effect_matched, q, cut, ill_conditioned, non_finite, dtype, posterior = terms
+    x_err, estimate, effect_matched, (q, unbounded, u) = terms[:4]
+    ill_conditioned, non_finite, dtype, posterior = terms[4:]
     norms = torch.linalg.vector_norm(
         torch.stack([x_err, effect_matched, estimate - effect_matched], dim=-2), dim=-1
     )
-    prediction_error, matched, unmatched = norms.masked_fill(non_finite, 0.0).split(1, dim=-1)
+    norms = norms.masked_fill(non_finite, 0.0)
+    prediction_error, matched, unmatched = norms.split_with_sizes([1, 1, 1], -1)
     diagnostics = L1Diagnostics(
         switch=torch.zeros_like(non_finite) if switch is None else switch,
         affinization_error=(
@@ -165,12 +185,17 @@ def diagnose(
         matched=matched / config.dt,
         unmatched=unmatched / config.dt,
         u_a=torch.linalg.vector_norm(q, dim=-1, keepdim=True).clamp_max(torch.finfo(q.dtype).max),
-        saturation=(cut & ~non_finite).to(q.dtype).mean(-1, keepdim=True),
+        saturation=_share((unbounded != u).masked_fill(non_finite, False), q.dtype),
         ill_conditioned=ill_conditioned,
         non_finite=non_finite,
         **_significance(posterior, prediction_error),
     )
     return narrow_entries(diagnostics, dtype)
+
+
+def _share(flags: Tensor, dtype: torch.dtype) -> Tensor:
+    share = flags.to(dtype)
+    return share if flags.shape[-1] == 1 else share.mean(-1, keepdim=True)
 
 
 def _significance(posterior: Posterior | None, like: Tensor) -> dict[str, Tensor]:

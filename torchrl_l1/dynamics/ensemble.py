@@ -88,6 +88,10 @@ ACTIVATIONS: dict[str, Activation] = {
 """Those that hidden layers may have."""
 
 
+def _entries(parameters: nn.ParameterList) -> list[Tensor]:
+    return [parameter for parameter in parameters._parameters.values() if parameter is not None]
+
+
 class EnsembleMLP(nn.Module):
     """``members`` perceptrons of equal shape, their weights stacked along a leading dimension.
 
@@ -238,25 +242,33 @@ class EnsembleMLP(nn.Module):
             ``(E, B, out)`` and derivatives ``(E, B, d, out)`` there.
         """
         activation, batch = ACTIVATIONS[self.activation].value_and_derivative, x.shape[1]
-        # Once each: a ParameterList takes as long to read as a small sum.
-        weights, biases = list(self.weights), list(self.biases)
-        hidden = x.flatten(0, 1).expand(self.members, -1, -1)
-        tangent = hidden[:, 2 * batch :] - hidden[:, :batch]
+        # Once each: a ParameterList takes as long to read as a small sum, each entry of it.
+        weights, biases = _entries(self.weights), _entries(self.biases)
+        thirds = [batch, batch, batch]
+        hidden = x.flatten(0, 1).expand(weights[0].shape[0], -1, -1)
         derivatives: list[Tensor] = []
         for layer, (weight, bias) in enumerate(zip(weights[:-1], biases[:-1], strict=True)):
             if layer == 0:
                 z = torch.bmm(hidden, weight).add_(bias)
-                tangent = z[:, 2 * batch :] - z[:, :batch]
+                first_z, _, tested_z = z.split_with_sizes(thirds, 1)
+                tangent = tested_z - first_z
             else:
                 stacked = torch.bmm(torch.cat([hidden, tangent], 1), weight)
-                z, tangent = stacked[:, : 3 * batch].add_(bias), stacked[:, 3 * batch :]
+                z, tangent = stacked.split_with_sizes([3 * batch, batch], 1)
+                z = z.add_(bias)
             hidden, derivative = activation(z)
             derivatives.append(derivative)
             tangent.mul_(derivative[:, :batch])
-        remainder = hidden[:, 2 * batch :] - hidden[:, :batch] - tangent
+        at_first, _, at_tested = hidden.split_with_sizes(thirds, 1)
+        remainder = at_tested - at_first
+        # Without hidden layers the tangent misses nothing.
+        remainder = remainder - (tangent if derivatives else remainder)
 
         def at(moved: Tensor) -> tuple[Tensor, Tensor]:
-            rows = torch.arange(batch, device=x.device) + batch * moved
+            if batch == 1:
+                rows = moved.long()
+            else:
+                rows = torch.arange(batch, device=x.device) + batch * moved
             value = torch.bmm(hidden.index_select(1, rows), weights[-1]).add_(biases[-1])
             tangents = weights[0][:, None, first:last].expand(-1, batch, -1, -1)
             for layer, (derivative, weight) in enumerate(

@@ -219,9 +219,10 @@ class EnsembleDynamics(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Mean change and Jacobian of the elites, of ``(E, B, out)`` and ``(E, B, m, out)``."""
         n, m = self.observation_dim, self.action_dim
-        change = self.change_normalizer.denormalize(self._over_elites(value)[:, :n])
+        mean, std = self.change_normalizer.mean, self.change_normalizer.std
+        change = self._over_elites(value)[:, :n] * std + mean
         jacobian = self._over_elites(tangent)[..., :n].transpose(-2, -1)
-        scale = self.change_normalizer.std[:, None] / self.action_normalizer.std
+        scale = std[:, None] / self.action_normalizer.std
         return change.reshape(shape), (jacobian * scale).reshape(*shape, m)
 
     def taylor_remainder(self, observation: Tensor, u_bar: Tensor, action: Tensor) -> Tensor:
@@ -367,8 +368,9 @@ class EnsembleDynamics(nn.Module):
 
     def _over_elites(self, per_member: Tensor) -> Tensor:
         """Mean of ``(E, ...)`` over the elites."""
-        if self.elites.shape[0] < self.members:
-            per_member = per_member[self.elites]
+        elites = self.elites
+        if elites.shape[0] < per_member.shape[0]:
+            per_member = per_member[elites]
         return per_member.mean(0)
 
     def _load_from_state_dict(

@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogFormatter, NullFormatter
 
 from torchrl_l1.algorithms.collection import ORACLE
 from torchrl_l1.atomic import write_through
@@ -182,6 +183,13 @@ def legend_below(figure: Figure, axes: Sequence[Axes], last: Sequence[str] = ())
 
 def save(figure: Figure, file: Path) -> Path:
     """Write a figure and close it."""
+    for each in figure.axes:
+        for axis in (each.xaxis, each.yaxis):
+            # Its own are formulas, which are off.
+            if isinstance(axis.get_major_formatter(), LogFormatter):
+                axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+                low, high = axis.get_view_interval()
+                axis.set_minor_formatter(LogFormatter() if high < 10 * low else NullFormatter())
     write_through(
         file, lambda buffer: figure.savefig(buffer, format=file.suffix[1:] or "png", dpi=130)
     )
