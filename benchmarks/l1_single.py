@@ -44,11 +44,11 @@ class Unsealed(L1Transform):
     """L1 with seals that are zero, and not looked at."""
 
     def _seal(self, nested: TensorDictBase, observation: Tensor) -> None:
-        nested.set(SEAL, observation.new_zeros(()).expand(*nested.shape, seal_width(self._width)))
-
-    @property
-    def _width(self) -> int:
-        return self._resolve().observation_dim
+        layout = self._resolve()
+        width = seal_width(
+            layout.observation_dim, layout.action_dim, "covariance" in self._state_names
+        )
+        nested.set(SEAL, observation.new_zeros(()).expand(*nested.shape, width))
 
 
 @torch.no_grad()

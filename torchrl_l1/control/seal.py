@@ -7,6 +7,7 @@ rollouts at a time need no care.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -16,42 +17,39 @@ from torch import Tensor
 from torchrl_l1.control.state import L1State
 
 SEAL = "seal"
-"""Name of the entry, ``(..., n + 4)``, beside those of the state."""
-
-_EXTRA = 4  # started, n_switch, and two sums
+"""Name of the entry beside those of the state, see :func:`seal_width`."""
 
 # Of entries of the same size: a change of type between float64 and float32 stays below it.
 _TOLERANCE = 1e-6
 
 _LARGEST = 3.3e38  # in the range of float32, to which float64 may be changed
 
-_IN_ACTION_UNITS = ("u_bar", "q", "sigma_m")
 
-
-def seal_width(observation_dim: int) -> int:
-    """Number of entries of a seal."""
-    return observation_dim + _EXTRA
+def seal_width(observation_dim: int, action_dim: int, has_memory: bool) -> int:
+    """Number of entries of a seal: the observation, the state, and a sum of a Kalman filter's."""
+    return 2 * observation_dim + 3 * action_dim + 2 + has_memory
 
 
 def sealed(observation: Tensor, state: L1State) -> Tensor:
-    """Observation, flags and sums of the state ``(..., n + 4)``, in the state's type.
+    """A copy of observation and state in the state's type, the caller may write to them in place.
 
-    The observation is copied, since the caller may write to it in place. Of the state, the sums of
-    entries in action units and of all others are kept apart, so that large observations do not
-    hide changes of small actions.
+    Of a Kalman filter's memory, which is wide, it is the sum.
     """
     # Every operation counts here: at a batch of one each costs as much as a thousand sums.
-    x_hat, u_bar, q, sigma_m, n_switch, started, *memory = state
-    others = x_hat
-    if memory[0] is not None:
-        others = torch.cat([x_hat, *(value for value in memory if value is not None)], -1)
-    others_sum = others.sum(-1, keepdim=True)
-    actions_sum = torch.cat([u_bar, q, sigma_m], -1).sum(-1, keepdim=True)
+    x_hat, *entries = state[:_NARROW]
+    parts = [observation.to(x_hat.dtype), x_hat, *entries]
+    if state.covariance is not None:
+        parts.append(torch.cat(_memory(state), -1).sum(-1, keepdim=True))
     # What is not finite is a number of its own here: whoever looks at the entries finds none.
-    dtype = x_hat.dtype
-    largest = min(torch.finfo(dtype).max, _LARGEST)
-    observation = observation.to(dtype).nan_to_num(0.9 * largest, largest, -largest)
-    return torch.cat([observation, started, n_switch, actions_sum, others_sum], -1).detach()
+    largest = min(torch.finfo(x_hat.dtype).max, _LARGEST)
+    return torch.cat(parts, -1).nan_to_num(0.9 * largest, largest, -largest).detach()
+
+
+_NARROW = L1State._fields.index("covariance")
+
+
+def _memory(state: L1State) -> list[Tensor]:
+    return [value for value in state[_NARROW:] if value is not None]
 
 
 class Emitted(NamedTuple):
@@ -102,7 +100,7 @@ def verify(
     Args:
         observation: ``(..., n)`` as read.
         state: as read.
-        seal: as read ``(..., n + 4)``.
+        seal: as read, see :func:`seal_width`.
         owner: name of the class that reads.
         observation_key: where it reads the observation.
         key: where it reads state and seal.
@@ -119,13 +117,15 @@ def verify(
         return observation
     found = sealed(observation, state)
     if not torch.equal(found, seal):
-        _compare(found, seal, owner, repr(observation_key), key, state, emitted, zero_is_none)
+        n = observation.shape[-1]
+        _compare(found, seal, n, owner, repr(observation_key), key, state, emitted, zero_is_none)
     return observation
 
 
 def _compare(
     found: Tensor,
     seal: Tensor,
+    n: int,
     owner: str,
     observation_key: str,
     key: str,
@@ -133,18 +133,14 @@ def _compare(
     emitted: Emitted | None,
     zero_is_none: bool,
 ) -> None:
-    n = found.shape[-1] - _EXTRA
     seal = seal.to(found.dtype)
-    differs = ~torch.isclose(found, seal, rtol=_TOLERANCE, atol=1e-30, equal_nan=True)
-    # A sum is as exact as its terms, which may be larger than it.
-    scale = found.abs().amax(-1, keepdim=True).nan_to_num()
-    if state is not None:
-        actions = torch.cat([getattr(state, name).abs() for name in _IN_ACTION_UNITS], -1)
-        rest = [state.x_hat, *(value for value in state[6:] if value is not None)]
-        others = torch.cat([value.abs() for value in rest], -1)
-        scale = torch.cat([actions.sum(-1, keepdim=True), others.sum(-1, keepdim=True)], -1)
-    off = (found[..., -2:] - seal[..., -2:]).abs() > 10 * _TOLERANCE * (1e-30 + scale)
-    differs = torch.cat([differs[..., :-2], differs[..., -2:] & off], -1)
+    differs = ~_close(found, seal)
+    m, has_memory = divmod(found.shape[-1] - 2 * n - 2, 3)
+    if has_memory:
+        # A sum is as exact as its terms, which may be larger than it.
+        terms = found if state is None else torch.cat(_memory(state), -1)
+        scale = terms.abs().sum(-1).nan_to_num()
+        differs[..., -1] &= (found - seal)[..., -1].abs() > 10 * _TOLERANCE * scale
     if zero_is_none:
         differs = differs & (seal != 0).any(-1, keepdim=True)
     if not differs.any():
@@ -152,12 +148,17 @@ def _compare(
     changed = differs[..., :n].any(-1)
     if emitted is not None and emitted.seal.shape == found.shape and changed.any():
         # With an observation that is right, it is the seal that is old, and the state with it.
-        last = emitted.seal[..., :n].to(found.dtype)
-        same = torch.isclose(found[..., :n], last, rtol=_TOLERANCE, atol=1e-30, equal_nan=True)
+        same = _close(found[..., :n], emitted.seal[..., :n].to(found.dtype))
         changed = changed & ~same.all(-1)
     if changed.any():
         raise ValueError(_of_observation(found, seal, changed, owner, observation_key, n))
-    raise ValueError(_of_state(owner, key, _lost(state, emitted)))
+    widths = [n, n, m, m, m, 1, 1] + [1] * has_memory
+    parts = [bool(part.any()) for part in differs.split(widths, -1)[1:]]
+    raise ValueError(_of_state(owner, key, _lost(parts, state, emitted)))
+
+
+def _close(found: Tensor, seal: Tensor) -> Tensor:
+    return torch.isclose(found, seal, rtol=_TOLERANCE, atol=1e-30, equal_nan=True)
 
 
 def _of_observation(
@@ -183,14 +184,19 @@ def _of_state(owner: str, key: str, names: list[str]) -> str:
     )
 
 
-def _lost(state: L1State | None, emitted: Emitted | None) -> list[str]:
-    if state is None:
-        return [*L1State._fields[:6], SEAL]
-    names = list(state.entries())
-    if emitted is None or emitted.state.x_hat.shape != state.x_hat.shape:
-        return names
-    read, given = state.entries(), emitted.state.entries()
-    return [name for name in names if not torch.equal(read[name], given[name])] or [SEAL]
+def _lost(parts: list[bool], state: L1State | None, emitted: Emitted | None) -> list[str]:
+    """Names of what differs, in the parts of the seal or, where that is old itself, from before."""
+    names = list(L1State._fields) if state is None else list(state.entries())
+    read: Sequence[Tensor | None] = () if state is None else state
+    given: Sequence[Tensor | None] = () if emitted is None else emitted.state
+    before = [
+        name
+        for name, a, b in zip(L1State._fields, read, given, strict=False)
+        if a is not None and b is not None and a.shape == b.shape and not torch.equal(a, b)
+    ]
+    differing = [name for name, part in zip(names[:_NARROW], parts, strict=False) if part]
+    memory = names[_NARROW:] if any(parts[_NARROW:]) else []
+    return before or differing + memory or [SEAL]
 
 
 def _versions(observation: Tensor, state: L1State) -> tuple[int, ...] | None:
@@ -212,7 +218,8 @@ def _verified(
 ) -> Tensor:
     if not torch.equal(found, seal):
         owner, observation_key, key = names
-        _compare(found, seal, owner, repr(observation_key), key, None, None, zero_is_none)
+        n = observation.shape[-1]
+        _compare(found, seal, n, owner, repr(observation_key), key, None, None, zero_is_none)
     return observation.clone()
 
 
