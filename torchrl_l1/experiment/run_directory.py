@@ -26,9 +26,9 @@ from torchrl_l1.experiment.files import (
     problem,
     read_text,
     saved,
+    settings_content,
     table_text,
     write_atomically,
-    yaml_text,
 )
 from torchrl_l1.experiment.settings import VOLATILE_KEYS, flatten, schema_defaults
 
@@ -465,7 +465,7 @@ def read_config(file: Path) -> dict[str, Any]:
         RunDirectoryError: if the file cannot be read.
     """
     try:
-        config = OmegaConf.to_container(OmegaConf.create(yaml_text(file)))
+        config = settings_content(file)
     except (yaml.YAMLError, RecursionError) as error:
         raise RunDirectoryError(f"cannot read {file}: {problem(error)}") from error
     # OmegaConf's own errors come in many kinds.

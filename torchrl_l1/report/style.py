@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from torchrl_l1.algorithms.collection import ORACLE
 from torchrl_l1.atomic import write_through
@@ -22,6 +21,8 @@ from torchrl_l1.report.identity import BASELINE
 
 # Labels hold values from files: what stands between dollars is no formula.
 matplotlib.rcParams["text.parse_math"] = False
+
+_DPI = 130
 
 # Okabe and Ito: told apart with any colour vision. Grey is kept for the authors' curves.
 _ARMS = {"off": "#D55E00", "paper": "#0072B2", "reference": "#009E73", "slow": "#CC79A7"}
@@ -118,14 +119,10 @@ def grid(panels: int, columns: int, width: float, height: float) -> tuple[Figure
     """A figure with so many panels, in rows of at most ``columns``; sizes in inches."""
     columns = min(panels, columns)
     rows = -(-panels // columns)
-    figure, axes = plt.subplots(
-        rows,
-        columns,
-        # A single panel still has to carry a legend of some width.
-        figsize=(max(width * columns, 6.4), height * rows),
-        squeeze=False,
-        constrained_layout=True,
-    )
+    # A single panel still has to carry a legend of some width.
+    figure = Figure(figsize=(max(width * columns, 6.4), height * rows), dpi=_DPI)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, squeeze=False)
     flat = list(axes.flat)
     for empty in flat[panels:]:
         empty.set_visible(False)
@@ -181,9 +178,10 @@ def legend_below(figure: Figure, axes: Sequence[Axes], last: Sequence[str] = ())
 
 
 def save(figure: Figure, file: Path) -> Path:
-    """Write a figure and close it."""
-    write_through(
-        file, lambda buffer: figure.savefig(buffer, format=file.suffix[1:] or "png", dpi=130)
-    )
-    plt.close(figure)
+    """Write a figure and clear it."""
+    # As a layout of the figure's own it would be followed by a drawing that nobody sees.
+    ConstrainedLayoutEngine().execute(figure)
+    write_through(file, lambda buffer: figure.savefig(buffer, format=file.suffix[1:] or "png"))
+    # It is full of circles, which would stay in memory for long.
+    figure.clear()
     return file
