@@ -21,7 +21,7 @@ from torchrl_l1.experiment.run_directory import (
     read_config,
     run_directories,
 )
-from torchrl_l1.experiment.wandb_files import ID_FILE
+from torchrl_l1.experiment.wandb_files import ID_FILE, draw_id, known_id
 
 
 def find_reusable(
@@ -80,6 +80,8 @@ def copy_run(source: Path, run: PlannedRun) -> None:
         if not _finished(copy, config) or differences(config, run.settings()):
             raise OSError("it has changed meanwhile")
         _keep_evaluations(source, temporary, {settings.name for settings in run.evaluations})
+        if known_id(source):
+            draw_id(temporary)
         config["run_dir"] = str(target)
         write_atomically(copy.config_file, OmegaConf.to_yaml(OmegaConf.create(config)))
         if target.exists() and run.directory.free():

@@ -70,12 +70,13 @@ class Failure:
             lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
         except OSError:
             return f"{self.job.name} {self.how}; there is no log"
-        tail = "\n".join(["", *(f"    {line}" for line in lines[-_LAST_LINES:])])
+        parts = [f"{self.job.name} {self.how}"]
         if problem := self._no_room():
-            return f"{self.job.name} {self.how}; {problem}" + f"; the end of {log}:{tail}" * any(
-                lines
-            )
-        return f"{self.job.name} {self.how}; the end of {log}:{tail}"
+            parts.append(problem)
+        if lines or not problem:
+            tail = (f"\n    {line}" for line in lines[-_LAST_LINES:])
+            parts.append("".join([f"the end of {log}:", *tail]))
+        return "; ".join(parts)
 
     def _no_room(self) -> str:
         """Why the log may lack the very reason; empty if there was room for it."""

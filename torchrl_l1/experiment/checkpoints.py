@@ -132,9 +132,10 @@ def keep_checkpoints(
     if settings.best and known and returns.index(max(known)) == len(rows) - 1:
         names.append("best.pt")
     elif settings.best and known and not (last.parent / KEPT / "best.pt").exists():
+        best = returns.index(max(known))
         say(
-            f"{last.parent}: checkpoint.best keeps nothing yet: iteration {returns.index(max(known))}"
-            " was the best, and its checkpoint is gone"
+            f"{last.parent}: checkpoint.best keeps nothing yet: iteration {best} was the best, and "
+            "its checkpoint is gone"
         )
     for name in names:
         copy_in_place(last, last.parent / KEPT / name)
