@@ -366,16 +366,16 @@ def test_what_cannot_be_written_whole_is_not_there(
     def torn(*arguments: Any, **options: Any) -> None:
         raise full
 
-    if output.endswith("-v0"):
-        minari = pytest.importorskip("minari")
-        pytest.importorskip("h5py")
-        monkeypatch.setattr(minari.utils, "MinariDataset", torn)  # all is written by then
-    elif output == "folder":
-        monkeypatch.setattr(torch.Tensor, "copy_", torn)
-    monkeypatch.setattr(os, "fsync", torn)
-    with pytest.raises(OSError, match="No space left"):
-        write_dataset(output, episodes, get_task("inverted_pendulum"), "random")
-    monkeypatch.undo()
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    task = get_task("inverted_pendulum")
+    with monkeypatch.context() as full_disk:
+        if output.endswith("-v0"):
+            minari = pytest.importorskip("minari")
+            pytest.importorskip("h5py")
+            full_disk.setattr(minari.utils, "MinariDataset", torn)  # all is written by then
+        elif output == "folder":
+            full_disk.setattr(torch.Tensor, "copy_", torn)
+        full_disk.setattr(os, "fsync", torn)
+        with pytest.raises(OSError, match="No space left"):
+            write_dataset(output, episodes, task, "random")
     assert not [file for file in tmp_path.rglob("*") if file.is_file()]
-    assert write_dataset(output, episodes, get_task("inverted_pendulum"), "random") == output
+    assert write_dataset(output, episodes, task, "random") == output

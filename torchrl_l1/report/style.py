@@ -11,6 +11,7 @@ import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -182,6 +183,7 @@ def save(figure: Figure, file: Path) -> Path:
     # As a layout of the figure's own it would be followed by a drawing that nobody sees.
     ConstrainedLayoutEngine().execute(figure)
     write_through(file, lambda buffer: figure.savefig(buffer, format=file.suffix[1:] or "png"))
-    # It is full of circles, which would stay in memory for long.
+    # It is full of circles, which would stay in memory for long, and the canvas holds its pixels.
     figure.clear()
+    FigureCanvasBase(figure)
     return file
