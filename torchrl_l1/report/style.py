@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -186,4 +187,5 @@ def save(figure: Figure, file: Path) -> Path:
     # It is full of circles, which would stay in memory for long, and the canvas holds its pixels.
     figure.clear()
     FigureCanvasBase(figure)
+    gc.collect(1)
     return file
