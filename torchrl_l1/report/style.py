@@ -180,12 +180,11 @@ def legend_below(figure: Figure, axes: Sequence[Axes], last: Sequence[str] = ())
 
 
 def save(figure: Figure, file: Path) -> Path:
-    """Write a figure and clear it."""
+    """Write a figure."""
     # As a layout of the figure's own it would be followed by a drawing that nobody sees.
     ConstrainedLayoutEngine().execute(figure)
     write_through(file, lambda buffer: figure.savefig(buffer, format=file.suffix[1:] or "png"))
-    # It is full of circles, which would stay in memory for long, and the canvas holds its pixels.
-    figure.clear()
+    # Nobody needs its pixels any more; circles of what was drawn before would stay for long.
     FigureCanvasBase(figure)
     gc.collect(1)
     return file
