@@ -20,6 +20,7 @@ from torchrl_l1.cli import main
 from torchrl_l1.experiment.files import locked
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.run_directory import RunDirectory
+from torchrl_l1.experiment.wandb_files import draw_id, known_id
 from torchrl_l1.report import find_runs
 from torchrl_l1.report.study import Study
 
@@ -319,3 +320,17 @@ def test_unknown_folders_are_named_before_anything_starts(
         printed = capsys.readouterr().err
         assert culprit in printed and "Traceback" not in printed
     assert not output.exists()
+
+
+def test_a_copy_is_another_run_for_wandb(
+    write: Callable[..., Path], first: PlannedRun, tmp_path: Path
+) -> None:
+    (this,) = planned(write("second", [0]), tmp_path / "second")
+    source = first.directory.path
+    (source / "wandb").mkdir()
+    (source / "wandb" / "log").write_text("of the source")
+    given = draw_id(source)
+    copy_run(source, this)
+    copied = known_id(this.directory.path)
+    assert copied is not None and copied != given == known_id(source)
+    assert not (this.directory.path / "wandb").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import threading
@@ -9,6 +10,7 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -152,3 +154,18 @@ def test_environment_has_one_thread(make_job: MakeJob) -> None:
     assert workers(1).work([job]) == []
     assert job.log.read_text() == "1 1\n"
     assert 1 <= available_cores() <= (os.cpu_count() or 1)
+
+
+def test_a_log_without_room_is_told_with_the_remedy(
+    make_job: MakeJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "deep/run.log.room"))
+    (silent,) = workers(1).work([make_job("exit 1")])
+    (cut,) = workers(1).work([make_job("echo begun; exit 1")])
+    assert "No space" not in str(silent) and not list(tmp_path.rglob("*.room"))
+    monkeypatch.setattr("torchrl_l1.campaign.workers.write_atomically", Mock(side_effect=full))
+    log = tmp_path / "deep/run.log"
+    line = f"; {log}: No space left on device; free some space"
+    assert line in str(cut) and str(cut).endswith("\n    begun")
+    log.write_text("")
+    assert line in str(silent) and "\n" not in str(silent)

@@ -124,3 +124,16 @@ def test_a_file_system_without_hard_links_gets_copies(
     run_dir = run(tiny_recipe(*KEEP))
     assert len(read_checkpoint(run_dir / "checkpoints" / "after_2.pt")["metrics"]) == 2
     assert len(read_checkpoint(run_dir / "checkpoint.pt")["metrics"]) == 2
+
+
+def test_the_best_that_is_gone_is_told(tmp_path: Path) -> None:
+    last, told = tmp_path / "checkpoint.pt", []
+    last.write_text("of iteration 2")
+    rows = [{"return_mean": value} for value in (1.0, 3.0, 2.0)]
+    keep_checkpoints(last, CheckpointSettings(best=True), rows, told.append)
+    assert not (tmp_path / "checkpoints").exists()
+    (line,) = told
+    assert line.startswith(f"{tmp_path}: checkpoint.best keeps nothing yet: iteration 1 was")
+    keep_checkpoints(last, CheckpointSettings(best=True), rows[:2], told.append)
+    keep_checkpoints(last, CheckpointSettings(best=True), rows, told.append)
+    assert (tmp_path / "checkpoints/best.pt").exists() and told == [line]

@@ -1,10 +1,13 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
+import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -351,3 +354,28 @@ def _small() -> dict[str, np.ndarray]:
         ),
         "episode": np.repeat([0, 1], 41),
     }
+
+
+@QUIET
+@pytest.mark.parametrize("output", ["data.npz", "folder", "pendulum/random-v0"])
+def test_what_cannot_be_written_whole_is_not_there(
+    output: str, episodes: list[Episode], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def torn(*arguments: Any, **options: Any) -> None:
+        raise full
+
+    task = get_task("inverted_pendulum")
+    with monkeypatch.context() as full_disk:
+        if output.endswith("-v0"):
+            minari = pytest.importorskip("minari")
+            pytest.importorskip("h5py")
+            full_disk.setattr(minari.utils, "MinariDataset", torn)  # all is written by then
+        elif output == "folder":
+            full_disk.setattr(torch.Tensor, "copy_", torn)
+        full_disk.setattr(os, "fsync", torn)
+        with pytest.raises(OSError, match="No space left"):
+            write_dataset(output, episodes, task, "random")
+    assert not [file for file in tmp_path.rglob("*") if file.is_file()]
+    assert write_dataset(output, episodes, task, "random") == output

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -276,3 +277,38 @@ def test_every_algorithm_stops_or_counts_and_is_reported(
     else:  # then it is left out, and the reason is told
         with pytest.raises(RunDirectoryError, match=r"return_mean is .nan.*training diverged in"):
             report([folder], tmp_path / "report")
+
+
+@pytest.mark.parametrize("mode", ["stop", "warn"])
+def test_a_policy_of_no_numbers_stops_the_run(
+    mode: str, tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step, count = TaskSimulation.step, iter(range(1000))
+
+    def spoilt(self: TaskSimulation, action: torch.Tensor) -> Any:
+        return step(self, action * math.nan if next(count) >= 40 else action)
+
+    monkeypatch.setattr(TaskSimulation, "step", spoilt)
+    with pytest.raises(RunDirectoryError) as error:
+        run(tiny_recipe(f"on_divergence={mode}"))
+    words = (
+        r"iteration \d, \w.*: 'action' of environment 0 is \[nan\].*look at policy\.std and trpo"
+    )
+    assert re.search(words, str(error.value)) and "on_divergence" not in str(error.value)
+
+
+def test_a_model_whose_predictions_are_no_numbers_stops_the_run(
+    tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fit = ModelLearning.fit
+
+    def spoilt(self: ModelLearning, *arguments: Any) -> Any:
+        found = fit(self, *arguments)
+        with torch.no_grad():
+            for part in self.dynamics.parameters():
+                part.mul_(1e30)  # finite still
+        return found
+
+    monkeypatch.setattr(ModelLearning, "fit", spoilt)
+    with pytest.raises(RunDirectoryError, match="iteration 0, fit: predictions of the model are"):
+        run(tiny_recipe())

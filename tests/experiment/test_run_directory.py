@@ -10,7 +10,7 @@ import pytest
 
 from torchrl_l1.experiment.errors import RunDirectoryInUse
 from torchrl_l1.experiment.files import locked
-from torchrl_l1.experiment.run_directory import RunDirectory, commit
+from torchrl_l1.experiment.run_directory import RunDirectory, commit, differences
 
 HOLD = """
 import subprocess, sys, time
@@ -113,3 +113,18 @@ def test_no_git_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     (tmp_path / ".git").mkdir()
     monkeypatch.setenv("PATH", "")
     assert commit(tmp_path / "package") is None
+
+
+def test_files_of_one_name_in_other_folders_are_compared(tmp_path: Path) -> None:
+    for folder, text in (("one", "a = 1"), ("copy", "a = 1"), ("other", "a = 2")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "own.py").write_text(text)
+    one, copy, other = (
+        {"algorithm": "pets", "task": "own.py:make", "search_path": [str(tmp_path / folder)]}
+        for folder in ("one", "copy", "other")
+    )
+    assert differences(one, copy) == [] == differences(one, one)
+    (found,) = differences(one, other)
+    assert found.startswith("search_path: [") and str(tmp_path / "other") in found
+    (tmp_path / "one/own.py").unlink()  # a project that has moved
+    assert differences(one, other) == []

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 import wandb
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 from wandb.proto import wandb_internal_pb2
 
@@ -22,9 +22,10 @@ from tests.wandb_server import wandb_server
 from torchrl_l1.campaign.description import read_campaign
 from torchrl_l1.campaign.plan import plan
 from torchrl_l1.cli import main
+from torchrl_l1.experiment import tracking
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.tracking import Evaluated, log_evaluation
+from torchrl_l1.experiment.tracking import Evaluated, Tracker, log_evaluation, trackers
 from torchrl_l1.experiment.wandb_files import ID_FILE, known_id, whole_records
 
 Recipe = Callable[..., DictConfig]
@@ -288,3 +289,29 @@ def logged(folder: Path, rows: int) -> bool:
     file = folder / "metrics.csv"
     begun = any(folder.glob("wandb/offline-run-*/*.wandb"))
     return begun and (not rows or (file.exists() and len(file.read_text().splitlines()) > rows))
+
+
+def test_a_logger_that_cannot_be_closed_leaves_none_open(
+    tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed = []
+
+    class Broken(Tracker):
+        def __init__(self, *_: object) -> None:
+            self.number = len(closed)
+
+        def log(self, metrics: Any, timing: Any) -> None: ...
+
+        def evaluation(self, evaluated: Any) -> None: ...
+
+        def close(self, status: int = 0) -> None:
+            closed.append(status)
+            raise OSError("no room")
+
+    monkeypatch.setattr(tracking, "WandbTracker", Broken)
+    monkeypatch.setattr(tracking, "TensorboardTracker", Broken)
+    config = tiny_recipe("loggers=[wandb,tensorboard]", "wandb.mode=offline")
+    recipe = OmegaConf.to_object(config)
+    with pytest.raises(OSError, match="no room"), trackers(recipe, tmp_path, {}, [], []) as opened:
+        assert len(opened) == 2
+    assert closed == [0, 0]

@@ -98,3 +98,12 @@ def test_every_algorithm_is_known_with_its_ways_to_act() -> None:
     }  # fmt: skip
     with pytest.raises(ValueError, match="'nothing'; there are metrpo, mbmf, offline, pets, dets"):
         facts("nothing")
+
+
+def test_runs_with_code_of_other_folders_are_no_seeds_of_each_other(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    for seed, place in enumerate(("one", "one", "other")):
+        write_run([1], f"search_path=[{place}]", seed=seed)
+    (study,) = studies(find_runs([tmp_path]))
+    assert sorted(len(runs) for runs in study.cells.values()) == [1, 2]

@@ -26,7 +26,7 @@ from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import FitConfig, calibrate_filter, make_dynamics
 from torchrl_l1.dynamics.network import model_precision
-from torchrl_l1.envs import AnyTask, Perturbation, get_task
+from torchrl_l1.envs import AnyTask, BadAction, Perturbation, get_task
 
 DEVICES = ("cpu", "cuda", "auto")
 """Where models may be fitted and trajectories imagined."""
@@ -59,14 +59,21 @@ class Diverged(ValueError):
 
     Attributes:
         iteration: the outer iteration in which that happened.
+        may_go_on: whether ``on_divergence=warn`` would have gone on.
     """
 
-    def __init__(self, iteration: int, phase: str, what: str, setting: str) -> None:
+    def __init__(
+        self, iteration: int, phase: str, what: str, setting: str, may_go_on: bool = True
+    ) -> None:
         super().__init__(
             f"training diverged in iteration {iteration}, {phase}: {what}; look at {setting}"
         )
         self.iteration = iteration
+        self.may_go_on = may_go_on
 
+
+# Transitions that a model has to predict in numbers.
+_PROBED = 64
 
 # What is finite in every round of a training that goes well, and the settings behind it if not.
 _FINITE = {
@@ -152,6 +159,7 @@ class Algorithm(ABC):
 
     Attributes:
         facts: what is known of the algorithm without running it.
+        policy_settings: settings to look at where a policy gives no numbers.
         config_class: the class of its settings.
         iteration: outer iterations that are complete.
         stops_on_divergence: whether to raise :class:`Diverged` where something is no longer
@@ -166,6 +174,7 @@ class Algorithm(ABC):
     """
 
     facts: ClassVar[AlgorithmFacts]
+    policy_settings: ClassVar[str] = "policy.std and trpo.max_kl"
     config_class: ClassVar[type[Any]]
     config: AlgorithmConfig
     learning: ModelLearning
@@ -265,11 +274,18 @@ class Algorithm(ABC):
         Args:
             name: one of ``facts.phases``.
             words: on what is going on; those of the phase by default.
+
+        Raises:
+            Diverged: if a policy acts that gives no numbers, whatever is to be done otherwise.
         """
         self._phase = self.facts.phases[name].words
         self.on_phase(words or self._phase)
         start = perf_counter()
-        yield
+        try:
+            yield
+        except BadAction as error:
+            settings = self.policy_settings
+            raise Diverged(self.iteration, self._phase, str(error), settings, False) from error
         self._seconds[name] += perf_counter() - start
 
     def fit(self) -> dict[str, float]:
@@ -278,6 +294,7 @@ class Algorithm(ABC):
             report = self.learning.fit(lambda epoch: self.on_phase(f"fit, epoch {epoch}"))
             self._check_finite(fit_metrics(report))
             self._check_weights("model", self.dynamics)
+            self._check_predictions()
             self.acting_dynamics.load_state_dict(self.dynamics.state_dict())
             self._calibrate_filter()
             learned = self._fit_outcomes()
@@ -336,7 +353,17 @@ class Algorithm(ABC):
 
     def _check_weights(self, name: str, module: nn.Module) -> None:
         if not all(bool(part.isfinite().all()) for part in module.parameters()):
-            self.diverged(f"weights of the {name} are not finite", _FINITE["model/"])
+            setting = self.policy_settings if name == "policy" else _FINITE["model/"]
+            self.diverged(f"weights of the {name} are not finite", setting)
+
+    def _check_predictions(self) -> None:
+        """Weights may be finite and their products not, and imagination go on along its bounds."""
+        data = self.learning.buffer[:][:_PROBED].to(self.device)
+        with torch.no_grad():
+            action = data[self.learning.action_key]
+            found = self.dynamics.mean_change(data["observation"], action)
+        if not bool(found.isfinite().all()):
+            self.diverged("predictions of the model are not finite", _FINITE["model/"])
 
     def check_plans(self, data: TensorDictBase) -> None:
         """Note it where no plan from a finite observation had a finite return.

@@ -62,6 +62,7 @@ class MBMF(Algorithm):
     """
 
     config_class = MBMFConfig
+    policy_settings = "cloning.learning_rate and fine_tuning.learning_rate"
     config: MBMFConfig
     facts = AlgorithmFacts(
         name="MBMF",

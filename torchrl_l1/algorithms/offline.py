@@ -93,6 +93,7 @@ class Offline(Algorithm):
     """
 
     config_class = OfflineConfig
+    policy_settings = "cloning.learning_rate, policy.std and trpo.max_kl"
     config: OfflineConfig
     facts = AlgorithmFacts(
         name="Offline",

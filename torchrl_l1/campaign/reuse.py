@@ -21,6 +21,7 @@ from torchrl_l1.experiment.run_directory import (
     read_config,
     run_directories,
 )
+from torchrl_l1.experiment.wandb_files import ID_FILE, draw_id, known_id
 
 
 def find_reusable(
@@ -79,6 +80,8 @@ def copy_run(source: Path, run: PlannedRun) -> None:
         if not _finished(copy, config) or differences(config, run.settings()):
             raise OSError("it has changed meanwhile")
         _keep_evaluations(source, temporary, {settings.name for settings in run.evaluations})
+        if known_id(source):
+            draw_id(temporary)
         config["run_dir"] = str(target)
         write_atomically(copy.config_file, OmegaConf.to_yaml(OmegaConf.create(config)))
         if target.exists() and run.directory.free():
@@ -90,8 +93,9 @@ def copy_run(source: Path, run: PlannedRun) -> None:
 
 
 def _left(folder: str, names: list[str]) -> set[str]:
-    """Locks, what was being written, links to folders, and what is neither file nor folder."""
-    found = set(shutil.ignore_patterns(".lock", "*.tmp")(folder, names))
+    """Locks, what was being written, W&B's files, links to folders, and what is no file."""
+    # W&B knows the source by its id; the copy is another run.
+    found = set(shutil.ignore_patterns(".lock", "*.tmp", ID_FILE, "wandb")(folder, names))
     for name in names:
         path = Path(folder, name)
         if path.is_dir() if path.is_symlink() else not (path.is_file() or path.is_dir()):

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import FrameType
 
 from torchrl_l1.experiment.errors import RunDirectoryError, message
-from torchrl_l1.experiment.files import refuse_link
+from torchrl_l1.experiment.files import refuse_link, write_atomically
 
 # A process that found another one at its work; EX_TEMPFAIL, a name that Windows does not have.
 TEMPORARY_FAILURE = 75
@@ -23,6 +23,8 @@ _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
 _STOPPING = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
 GRACE_SECONDS = 10.0
 _LAST_LINES = 15
+# As much as a few files of a tiny run take.
+_ROOM = 65_536
 
 
 @dataclass
@@ -63,12 +65,30 @@ class Failure:
 
     def __str__(self) -> str:
         """Name, how it ended, and the end of the log."""
+        log = self.job.log
         try:
-            lines = self.job.log.read_text(encoding="utf-8", errors="replace").splitlines()
+            lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
         except OSError:
             return f"{self.job.name} {self.how}; there is no log"
-        tail = "\n".join(f"    {line}" for line in lines[-_LAST_LINES:])
-        return f"{self.job.name} {self.how}; the end of {self.job.log}:\n{tail}"
+        parts = [f"{self.job.name} {self.how}"]
+        if problem := self._no_room():
+            parts.append(problem)
+        if lines or not problem:
+            tail = (f"\n    {line}" for line in lines[-_LAST_LINES:])
+            parts.append("".join([f"the end of {log}:", *tail]))
+        return "; ".join(parts)
+
+    def _no_room(self) -> str:
+        """Why the log may lack the very reason; empty if there was room for it."""
+        probe = self.job.log.with_name(f"{self.job.log.name}.room")
+        try:
+            refuse_link(probe)
+            write_atomically(probe, bytes(_ROOM))
+            probe.unlink()
+        except (OSError, RunDirectoryError) as error:
+            # The probe is gone; it is the log that has no room.
+            return message(error).replace(str(probe), str(self.job.log))
+        return ""
 
 
 class Stopped(Exception):

@@ -41,6 +41,7 @@ from torchrl_l1.experiment.matrix import (
     conditions,
 )
 from torchrl_l1.experiment.recipes import group_setting
+from torchrl_l1.experiment.run_directory import same_code_in
 from torchrl_l1.experiment.settings import RunSettings, WandbSettings
 from torchrl_l1.experiment.tracking import Evaluated, log_evaluation
 from torchrl_l1.report.evaluation_figures import RANGES, plot_disturbances
@@ -185,6 +186,11 @@ def _check_one_study(runs: Sequence[TrainedRun]) -> None:
                     "one at a time"
                 )
     for trained in runs[1:]:
+        if not same_code_in(vars(runs[0].recipe), vars(trained.recipe)):
+            raise ValueError(
+                f"{runs[0].path} and {trained.path} name files that are not the same (search_path);"
+                " evaluate them one at a time"
+            )
         if settings(trained) != settings(runs[0]):
             raise ValueError(
                 f"{runs[0].path} and {trained.path} differ in more than their seed; evaluate them "

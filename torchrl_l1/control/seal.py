@@ -36,8 +36,8 @@ def sealed(observation: Tensor, state: L1State) -> Tensor:
     Of a Kalman filter's memory, which is wide, it is the sum.
     """
     # Every operation counts here: at a batch of one each costs as much as a thousand sums.
-    x_hat, *entries = state[:_NARROW]
-    parts = [observation.to(x_hat.dtype), x_hat, *entries]
+    x_hat, u_bar, q, sigma_m, n_switch, started, *_ = state
+    parts = [observation.to(x_hat.dtype), x_hat, u_bar, q, sigma_m, n_switch, started]
     if state.covariance is not None:
         parts.append(torch.cat(_memory(state), -1).sum(-1, keepdim=True))
     # What is not finite is a number of its own here: whoever looks at the entries finds none.

@@ -31,11 +31,11 @@ from torchrl_l1.envs.perturbations import (
     suite,
 )
 from torchrl_l1.envs.plant import disturbed_model, wind_force
-from torchrl_l1.envs.references import load_attribute, load_module
+from torchrl_l1.envs.references import load_attribute, load_module, same_code
 from torchrl_l1.envs.sensors import SensorBias, SensorDelay, SensorDropout
 from torchrl_l1.envs.simulation import BatchedSimulator, StartStates, TaskSimulation
 from torchrl_l1.envs.sources import EnvironmentSource, environment_source, vector_environment
-from torchrl_l1.envs.task import AnyTask, Task, action_bounds
+from torchrl_l1.envs.task import AnyTask, BadAction, Task, action_bounds
 from torchrl_l1.envs.tasks import TASKS, get_task
 from torchrl_l1.registration import gymnasium_id, register_tasks
 
@@ -50,6 +50,7 @@ __all__ = [
     "ActuatorDelay",
     "ActuatorGain",
     "AnyTask",
+    "BadAction",
     "BatchedMujocoEnv",
     "BatchedSimulator",
     "DeadZone",
@@ -83,6 +84,7 @@ __all__ = [
     "load_module",
     "make_env",
     "register_tasks",
+    "same_code",
     "suite",
     "vector_environment",
     "wind_force",

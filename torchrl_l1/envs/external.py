@@ -21,7 +21,7 @@ from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
 from torchrl_l1.envs.plant import disturbed_model
 from torchrl_l1.envs.references import making
 from torchrl_l1.envs.sources import EnvironmentSource, environment_source
-from torchrl_l1.envs.task import RewardFn, Scalars, Task
+from torchrl_l1.envs.task import BadAction, RewardFn, Scalars, Task
 
 
 class ExternalTask:
@@ -257,7 +257,7 @@ class ExternalEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         actions = tensordict.get("action").detach().float().numpy().clip(self._low, self._high)
         if not np.isfinite(actions).all():
-            raise ValueError("'action' is not finite; check the policy's output")
+            raise BadAction("'action' is not finite; check the policy's output")
         reward = np.zeros(self.num_envs, dtype=np.float32)
         bad, terminated, truncated = (np.zeros(self.num_envs, dtype=bool) for _ in range(3))
         for index, (cell, action) in enumerate(zip(self.cells, actions, strict=True)):

@@ -113,6 +113,29 @@ def folders_of(names: Iterable[str], folders: Iterable[Path]) -> list[str]:
     return found
 
 
+def same_code(names: Iterable[str], one: Sequence[str | Path], other: Sequence[str | Path]) -> bool:
+    """Whether names mean the same along two search paths, as far as their files can be found.
+
+    Args:
+        names: such as ``envs.py:make_env`` or ``my_package:MyEnv-v0``.
+        one: a search path.
+        other: another one.
+    """
+    for name in names if list(one) != list(other) else ():
+        found = [_file_of(name.rpartition(":")[0], folders) for folders in (one, other)]
+        if None not in found and len({file.read_bytes() for file in found if file}) > 1:
+            return False
+    return True
+
+
+def _file_of(module: str, folders: Sequence[str | Path]) -> Path | None:
+    """The first file of a module or of this name in some folders."""
+    name = module if module.endswith(".py") else module.replace(".", "/")
+    endings = ("",) if module.endswith(".py") else (".py", "/__init__.py")
+    places = (Path(folder, name + ending) for folder in folders for ending in endings if module)
+    return next((place for place in places if place.is_file()), None)
+
+
 def _places(name: str, search_path: Sequence[str | Path]) -> list[Path]:
     return [Path(folder, name) for folder in (*search_path, Path.cwd())]
 

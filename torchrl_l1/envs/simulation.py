@@ -12,7 +12,7 @@ from mujoco.batch import Batch
 from torch import Tensor
 
 from torchrl_l1.envs.plant import Plant, PlantValue
-from torchrl_l1.envs.task import Task
+from torchrl_l1.envs.task import BadAction, Task
 from torchrl_l1.envs.tasks import built_in_task
 
 # Beyond this magnitude MuJoCo itself calls a number bad (mjMAXVAL).
@@ -268,7 +268,7 @@ class TaskSimulation:
         # Written so that NaN fails too; MuJoCo would replace such an input by zero.
         if not magnitude.max() <= MAX_MAGNITUDE:
             index = int(np.flatnonzero(~(magnitude <= MAX_MAGNITUDE).all(1))[0])
-            raise ValueError(
+            raise BadAction(
                 f"'action' of environment {index} is {action[index].tolist()}: every entry must "
                 f"be finite and at most {MAX_MAGNITUDE:g} in magnitude; check the policy's output"
             )

@@ -22,6 +22,10 @@ ResetFn = Callable[
 ]
 
 
+class BadAction(ValueError):
+    """An action that no environment can be given: not finite, or beyond all bounds."""
+
+
 def never(next_observation: Tensor) -> Tensor:
     """No state ends the episode."""
     return torch.zeros(

@@ -6,7 +6,7 @@ import math
 import pickle
 import warnings
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -111,7 +111,10 @@ def load_state(algorithm: Algorithm, state: dict[str, Any], file: Path) -> None:
 
 
 def keep_checkpoints(
-    last: Path, settings: CheckpointSettings, rows: Sequence[Mapping[str, Any]]
+    last: Path,
+    settings: CheckpointSettings,
+    rows: Sequence[Mapping[str, Any]],
+    say: Callable[[str], object] = lambda line: None,
 ) -> None:
     """Keep the last checkpoint, where it is one that a recipe keeps, in the folder :data:`KEPT`.
 
@@ -119,6 +122,7 @@ def keep_checkpoints(
         last: the run's last checkpoint.
         settings: which are kept.
         rows: rows of the metrics, as in that checkpoint.
+        say: told in a line where the best one is gone, since none was kept at its time.
     """
     names = []
     if settings.every is not None and rows and len(rows) % settings.every == 0:
@@ -127,6 +131,12 @@ def keep_checkpoints(
     known = [value for value in returns if not math.isnan(value)]
     if settings.best and known and returns.index(max(known)) == len(rows) - 1:
         names.append("best.pt")
+    elif settings.best and known and not (last.parent / KEPT / "best.pt").exists():
+        best = returns.index(max(known))
+        say(
+            f"{last.parent}: checkpoint.best keeps nothing yet: iteration {best} was the best, and "
+            "its checkpoint is gone"
+        )
     for name in names:
         copy_in_place(last, last.parent / KEPT / name)
 

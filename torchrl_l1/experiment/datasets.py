@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Callable, Sequence
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -14,12 +17,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_l1.algorithms import DatasetColumns
+from torchrl_l1.atomic import write_through
 from torchrl_l1.dynamics import read_csv, read_minari, read_npz
 from torchrl_l1.envs import AnyTask, action_bounds
 from torchrl_l1.experiment.checkpoints import read_checkpoint
 from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.registration import EPISODE_STEPS, gymnasium_id
 
+_MINARI_FOLDER = "MINARI_DATASETS_PATH"
 _MINARI_NAME = re.compile(r"[-\w/]+-v\d+")
 _CHECKPOINTS = ("checkpoint.pt", "checkpoint_previous.pt")
 _PICKLES = ("*.pkl", "*.pickle")
@@ -281,12 +286,39 @@ def write_dataset(output: str, episodes: Sequence[Episode], task: AnyTask, algor
     check_output(output)
     if path.suffix == ".npz":
         path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(path, **_rows(episodes))  # type: ignore[arg-type]
+        rows: dict[str, Any] = _rows(episodes)
+        write_through(path, lambda buffer: np.savez_compressed(buffer, **rows))
     elif _MINARI_NAME.fullmatch(output):
         _write_minari(output, episodes, task, algorithm)
     else:
-        _transitions(episodes).memmap(path)
+        _write_folder(path, _transitions(episodes))
     return output
+
+
+def _write_folder(path: Path, data: TensorDictBase) -> None:
+    """Write a memory-mapped tensordict, whole or not at all."""
+    with _beside(path) as temporary:
+        try:
+            data.memmap(temporary)
+        except RuntimeError as error:  # what torch says of a disk without room
+            raise ValueError(f"{path} cannot be written: {error}") from error
+
+
+@contextmanager
+def _beside(path: Path) -> Iterator[Path]:
+    """A folder to write to, which is moved to its place once the block has ended well."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        if temporary.is_symlink():
+            temporary.unlink()
+        shutil.rmtree(temporary, ignore_errors=True)
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(path)) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def check_output(output: str) -> None:
@@ -371,6 +403,7 @@ def _write_minari(name: str, episodes: Sequence[Episode], task: AnyTask, algorit
     import minari
     from gymnasium.spaces import Box
     from minari.data_collector.episode_buffer import EpisodeBuffer
+    from minari.storage.datasets_root_dir import get_dataset_path
 
     buffers = [
         EpisodeBuffer(
@@ -385,11 +418,30 @@ def _write_minari(name: str, episodes: Sequence[Episode], task: AnyTask, algorit
         for number, episode in enumerate(episodes)
     ]
     low, high = (bound.numpy() for bound in action_bounds(task))
-    minari.create_dataset_from_buffers(
-        name,
-        buffers,
-        env=gymnasium_id(task.name) if task.name in EPISODE_STEPS else None,
-        observation_space=Box(-np.inf, np.inf, (task.observation_dim,), np.float32),
-        action_space=Box(low, high, dtype=np.float32),
-        algorithm_name=algorithm,
-    )
+    # Minari writes file by file; a kill would leave a part under the name of the whole.
+    with _beside(get_dataset_path(name)) as temporary, _minari_in(temporary):
+        minari.create_dataset_from_buffers(
+            name,
+            buffers,
+            env=gymnasium_id(task.name) if task.name in EPISODE_STEPS else None,
+            observation_space=Box(-np.inf, np.inf, (task.observation_dim,), np.float32),
+            action_space=Box(low, high, dtype=np.float32),
+            algorithm_name=algorithm,
+        )
+        for part in (temporary / name).iterdir():
+            part.rename(temporary / part.name)
+        shutil.rmtree(temporary / name.split("/")[0])
+
+
+@contextmanager
+def _minari_in(folder: Path) -> Iterator[None]:
+    """Let Minari take a folder for the one of all datasets."""
+    before = os.environ.get(_MINARI_FOLDER)
+    os.environ[_MINARI_FOLDER] = str(folder)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_MINARI_FOLDER]
+        else:
+            os.environ[_MINARI_FOLDER] = before

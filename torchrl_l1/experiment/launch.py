@@ -31,7 +31,14 @@ from torchrl_l1.experiment.recipes import (
     shared_dir,
 )
 from torchrl_l1.experiment.run import final_return, run
-from torchrl_l1.experiment.settings import SCHEMAS, WandbSettings, check_known, flatten, register
+from torchrl_l1.experiment.settings import (
+    NAMING_KEYS,
+    SCHEMAS,
+    WandbSettings,
+    check_known,
+    flatten,
+    register,
+)
 
 # What does not tell results apart, or is named in another way.
 _IN_NO_NAME = (
@@ -297,10 +304,6 @@ def _name(recipe: Path, overrides: Sequence[str]) -> list[str]:
     return [] if named else [f"recipe='{stem}'"]
 
 
-# Keys that may name code of the user's.
-_NAMING = ("task", "reward", "termination")
-
-
 def _search_path_override(recipe: Path, config: DictConfig, overrides: Sequence[str]) -> list[str]:
     """The folders of what a recipe names, told to every process that runs a part of it."""
     if config.get("search_path"):
@@ -313,8 +316,8 @@ def _search_path_override(recipe: Path, config: DictConfig, overrides: Sequence[
 def _folders_of_code(recipe: Path, config: DictConfig, overrides: Sequence[str]) -> list[str]:
     """Folders with modules and files that settings name: that of the recipe, or where we are."""
     given = [text.partition("=") for text in overrides]
-    names = [name for key, _, value in given if key in _NAMING for name in value.split(",")]
-    values = (OmegaConf.select(config, key) for key in _NAMING)
+    names = [name for key, _, value in given if key in NAMING_KEYS for name in value.split(",")]
+    values = (OmegaConf.select(config, key) for key in NAMING_KEYS)
     names += [str(value) for value in values if value is not None]
     own = [] if recipe.is_relative_to(recipes_dir()) else [recipe.parent]
     return folders_of(names, [*own, Path.cwd()])

@@ -108,7 +108,7 @@ def _run(
             if restored:
                 names = ", ".join(restored)
                 progress.write(f"{directory.path}: written again from the checkpoint: {names}")
-            keep_checkpoints(directory.checkpoint_file, recipe.checkpoint, rows)
+            keep_checkpoints(directory.checkpoint_file, recipe.checkpoint, rows, progress.write)
         if len(rows) >= recipe.outer_iterations and not lacks(recipe, directory.path, rows):
             progress.write(f"{directory.path} is complete: nothing to do")
             return
@@ -135,9 +135,9 @@ def _run(
                     sys.exit(RESUME_ME)
         except Diverged as error:
             directory.mark_diverged(str(error), rows)
+            warn = ", and on_divergence=warn goes on all the same" * error.may_go_on
             raise RunDirectoryError(
-                f"{directory.path}: {error}; the checkpoint of {len(rows)} iterations stays, and "
-                "on_divergence=warn goes on all the same"
+                f"{directory.path}: {error}; the checkpoint of {len(rows)} iterations stays{warn}"
             ) from error
 
 

@@ -19,6 +19,7 @@ import yaml  # type: ignore[import-untyped]
 from omegaconf import OmegaConf
 
 import torchrl_l1
+from torchrl_l1.envs import same_code
 from torchrl_l1.experiment.checkpoints import read_checkpoint
 from torchrl_l1.experiment.errors import RunDirectoryError, RunDirectoryInUse, message
 from torchrl_l1.experiment.files import (
@@ -27,11 +28,11 @@ from torchrl_l1.experiment.files import (
     problem,
     read_text,
     saved,
+    settings_content,
     table_text,
     write_atomically,
-    yaml_text,
 )
-from torchrl_l1.experiment.settings import VOLATILE_KEYS, flatten, schema_defaults
+from torchrl_l1.experiment.settings import NAMING_KEYS, VOLATILE_KEYS, flatten, schema_defaults
 
 PACKAGES = ("torch", "tensordict", "torchrl", "gymnasium", "mujoco", "numpy")
 
@@ -432,6 +433,7 @@ def differences(
         ['seed: 0 there, 1 now']
     """
     defaults = schema_defaults(now)
+    other_code = [] if same_code_in(before, now) else ["search_path"]
     before, now = flatten(before), flatten(now)
     before = {k: v for k, v in defaults.items() if k in now} | before
     had, has = before.get(_MAY_GROW, 0), now.get(_MAY_GROW, 0)
@@ -441,8 +443,15 @@ def differences(
     return [
         f"{key}: {before.get(key, '(absent)')} there, {now.get(key, '(absent)')} now"
         for key in sorted(before.keys() | now.keys())
-        if before.get(key) != now.get(key) and key.split(".")[0] not in VOLATILE_KEYS
+        if key in other_code
+        or (before.get(key) != now.get(key) and key.split(".")[0] not in VOLATILE_KEYS)
     ]
+
+
+def same_code_in(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    """Whether files and modules that settings name are the same in both; paths may differ."""
+    paths = [list(map(str, config.get("search_path") or ())) for config in (before, now)]
+    return same_code([str(now.get(key)) for key in NAMING_KEYS], *paths)
 
 
 def run_directories(folder: Path) -> Iterator[tuple[Path, dict[str, Any] | RunDirectoryError]]:
@@ -472,7 +481,7 @@ def read_config(file: Path) -> dict[str, Any]:
         RunDirectoryError: if the file cannot be read.
     """
     try:
-        config = OmegaConf.to_container(OmegaConf.create(yaml_text(file)))
+        config = settings_content(file)
     except (yaml.YAMLError, RecursionError) as error:
         raise RunDirectoryError(f"cannot read {file}: {problem(error)}") from error
     # OmegaConf's own errors come in many kinds.

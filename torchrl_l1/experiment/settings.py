@@ -248,6 +248,9 @@ VOLATILE_KEYS = (
     *("run_dir", "resume", "wandb", "on_divergence", "loggers", "checkpoint", "search_path"),
 )
 
+NAMING_KEYS = ("task", "reward", "termination")
+"""Keys that may name code of the user's, which the search path is for."""
+
 
 def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
     """Nested settings by dotted key.

@@ -12,7 +12,7 @@ import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -328,8 +328,9 @@ def trackers(
         yield opened
         status = 0
     finally:
-        for tracker in opened:
-            tracker.close(status)
+        with ExitStack() as closing:  # one that fails keeps none open
+            for tracker in reversed(opened):
+                closing.callback(tracker.close, status)
 
 
 def _rows(file: Path) -> list[dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import math
 import os
 from collections.abc import Sequence
@@ -26,6 +27,9 @@ from torchrl_l1.report.training import run_rows, training_sections
 
 def report_command(options: argparse.Namespace) -> None:
     """Write the report and say where it is."""
+    # The packages stay. Without them what figures leave behind is soon much, and is collected.
+    gc.freeze()
+    gc.collect()
     page = report(
         list(dict.fromkeys(map(Path, options.dir))),
         Path(options.output) if options.output else None,

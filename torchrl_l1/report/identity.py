@@ -42,7 +42,8 @@ NOISES = ("none", "action", "observation", "both")
 """Noise settings in the order in which tables and figures show them."""
 
 # Keys that tell runs apart in other ways, or that do not touch the result.
-_NOT_COMPARED = (*VOLATILE_KEYS, "seed", "task", "threads", "device", "compile_plans", "l1.compile")
+_VOLATILE = [key for key in VOLATILE_KEYS if key != "search_path"]
+_NOT_COMPARED = (*_VOLATILE, "seed", "task", "threads", "device", "compile_plans", "l1.compile")
 # Two ways to give the gain of the filter, which is compared under the first of these names.
 _FILTER_KEYS = ("l1.alpha", "l1.cutoff")
 _NOISE_KEYS = ("perturbation.action_noise", "perturbation.observation_noise")
@@ -116,7 +117,7 @@ def identify(config: Mapping[str, Any]) -> Identity:
         _clean(key): _text(value)
         for key, value in settings.items()
         if key not in (*_NOT_COMPARED, *_NOISE_KEYS, *_FILTER_KEYS)
-        and key.split(".")[0] not in VOLATILE_KEYS
+        and key.split(".")[0] not in _VOLATILE
     }
     l1 = {k: v for k, v in compared.items() if k.startswith("l1.")}
     on = arm != BASELINE

@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -143,15 +144,14 @@ def _condition_rows(
     file: Path, numbers: Sequence[str], optional: Sequence[str] = ()
 ) -> list[dict[str, Any]]:
     """Rows with the columns of conditions and others; disturbances as far as there are any."""
-    later = [name for name in DISTURBANCES if name not in _FIRST_DISTURBANCES]
-    there = checked_rows(file, (), optional_words=later) if later else []
-    found = [*_FIRST_DISTURBANCES, *(n for n in later if any(row[n] for row in there))]
+    later = tuple(name for name in DISTURBANCES if name not in _FIRST_DISTURBANCES)
     return checked_rows(
         file,
-        (*found, *numbers),
+        (*_FIRST_DISTURBANCES, *numbers),
         ("l1", "noise", "policy"),
         ("epsilon", "alpha", *optional),
         ("stage",),
+        later,
     )
 
 
@@ -188,6 +188,7 @@ def checked_rows(
     words: Sequence[str] = (),
     optional: Sequence[str] = (),
     optional_words: Sequence[str] = (),
+    if_any: Sequence[str] = (),
 ) -> list[dict[str, Any]]:
     """As :func:`numeric_rows`, of a file of a run directory.
 
@@ -195,7 +196,7 @@ def checked_rows(
         RunDirectoryError: in its place, with what to do about it.
     """
     try:
-        return numeric_rows(file, numbers, words, optional, optional_words)
+        return numeric_rows(file, numbers, words, optional, optional_words, if_any)
     except ValueError as error:
         raise RunDirectoryError(f"{error}. Move the run directory away, or run it again") from error
 
@@ -219,6 +220,7 @@ def numeric_rows(
     words: Sequence[str] = (),
     optional: Sequence[str] = (),
     optional_words: Sequence[str] = (),
+    if_any: Sequence[str] = (),
 ) -> list[dict[str, Any]]:
     """Some columns of a CSV file.
 
@@ -228,39 +230,52 @@ def numeric_rows(
         words: columns of text that must not be empty.
         optional: columns of numbers that may be absent, empty or not finite: NaN then.
         optional_words: columns of text that may be absent or empty.
+        if_any: columns that are left out if absent or empty, else of finite numbers.
 
     Raises:
         ValueError: if the file cannot be read, a column is missing, or a cell holds something
             else; the message names file and line.
     """
     try:
-        reader = csv.DictReader(io.StringIO(read_text(file, _MOST_BYTES), newline=""), strict=True)
-        missing = [k for k in (*words, *numbers) if k not in (reader.fieldnames or ())]
+        reader = csv.reader(io.StringIO(read_text(file, _MOST_BYTES), newline=""), strict=True)
+        # The last of equal names counts.
+        place = {name: index for index, name in enumerate(next(reader, []))}
+        missing = [k for k in (*words, *numbers) if k not in place]
         if missing:
             raise ValueError(f"{file} has no column {', '.join(missing)}")
-        rows = list(reader)
+        rows = [row for row in reader if row]
+        most = max(map(len, rows), default=0)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"cannot read {file}: {error}") from error
-    return [
-        {
-            **{key: _word(file, line, key, row[key]) for key in words},
-            **{key: _number(file, line, key, row[key]) for key in numbers},
-            **{key: _value(row.get(key)) for key in optional},
-            **{
-                key: _word(file, line, key, row[key]) if row.get(key) else ""
-                for key in optional_words
-            },
-        }
-        for line, row in enumerate(rows, start=2)
-    ]
+
+    def column(key: str) -> list[str | None]:
+        at = place.get(key, most)
+        return [row[at] if at < len(row) else None for row in rows]
+
+    found: dict[str, list[Any]] = {}
+    for key in words:
+        found[key] = [_word(file, i, key, text) for i, text in enumerate(column(key), start=2)]
+    for key in (*numbers, *(key for key in if_any if any(column(key)))):
+        found[key] = [_number(file, i, key, text) for i, text in enumerate(column(key), start=2)]
+    for key in optional:
+        found[key] = [_value(text) for text in column(key)]
+    for key in optional_words:
+        texts = enumerate(column(key), start=2)
+        found[key] = [_word(file, i, key, text) if text else "" for i, text in texts]
+    return [dict(zip(found, row, strict=True)) for row in zip(*found.values(), strict=True)]
 
 
 def _word(file: Path, line: int, key: str, text: str | None) -> str:
     if not text:
         raise ValueError(f"{file}, line {line}: {key} is empty")
-    if not re.fullmatch(r"[^\x00-\x1f<>|`\\\[\]]{1,100}", text):
+    if not _is_word(text):
         raise ValueError(f"{file}, line {line}: {key} is {text[:40]!r}, which is no word")
     return text
+
+
+@lru_cache(1000)
+def _is_word(text: str) -> bool:
+    return re.fullmatch(r"[^\x00-\x1f<>|`\\\[\]]{1,100}", text) is not None
 
 
 def _number(file: Path, line: int, key: str, text: str | None) -> float:

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import gc
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import FigureCanvasBase
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter, LogFormatter, NullFormatter
 
 from torchrl_l1.algorithms.collection import ORACLE
@@ -23,6 +24,8 @@ from torchrl_l1.report.identity import BASELINE
 
 # Labels hold values from files: what stands between dollars is no formula.
 matplotlib.rcParams["text.parse_math"] = False
+
+_DPI = 130
 
 # Okabe and Ito: told apart with any colour vision. Grey is kept for the authors' curves.
 _ARMS = {"off": "#D55E00", "paper": "#0072B2", "reference": "#009E73", "slow": "#CC79A7"}
@@ -119,14 +122,10 @@ def grid(panels: int, columns: int, width: float, height: float) -> tuple[Figure
     """A figure with so many panels, in rows of at most ``columns``; sizes in inches."""
     columns = min(panels, columns)
     rows = -(-panels // columns)
-    figure, axes = plt.subplots(
-        rows,
-        columns,
-        # A single panel still has to carry a legend of some width.
-        figsize=(max(width * columns, 6.4), height * rows),
-        squeeze=False,
-        constrained_layout=True,
-    )
+    # A single panel still has to carry a legend of some width.
+    figure = Figure(figsize=(max(width * columns, 6.4), height * rows), dpi=_DPI)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, squeeze=False)
     flat = list(axes.flat)
     for empty in flat[panels:]:
         empty.set_visible(False)
@@ -182,7 +181,7 @@ def legend_below(figure: Figure, axes: Sequence[Axes], last: Sequence[str] = ())
 
 
 def save(figure: Figure, file: Path) -> Path:
-    """Write a figure and close it."""
+    """Write a figure."""
     for each in figure.axes:
         for axis in (each.xaxis, each.yaxis):
             # Its own are formulas, which are off.
@@ -190,8 +189,10 @@ def save(figure: Figure, file: Path) -> Path:
                 axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
                 low, high = axis.get_view_interval()
                 axis.set_minor_formatter(LogFormatter() if high < 10 * low else NullFormatter())
-    write_through(
-        file, lambda buffer: figure.savefig(buffer, format=file.suffix[1:] or "png", dpi=130)
-    )
-    plt.close(figure)
+    # As a layout of the figure's own it would be followed by a drawing that nobody sees.
+    ConstrainedLayoutEngine().execute(figure)
+    write_through(file, lambda buffer: figure.savefig(buffer, format=file.suffix[1:] or "png"))
+    # Nobody needs its pixels any more; circles of what was drawn before would stay for long.
+    FigureCanvasBase(figure)
+    gc.collect(1)
     return file
