@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -88,8 +89,13 @@ def test_fitting_without_peers(small: None, monkeypatch) -> None:
     monkeypatch.setattr(fitting, "BATCHES", 2)
     monkeypatch.setattr(fitting, "BATCH_SIZE", 50)
     rows = fitting.run(1)
-    assert [row["penalty"] for row in rows] == list(fitting.DECAYS)
-    assert all(row["samples"] > 0 for row in rows)
+    cases = [(row["penalty"], row["implementation"]) for row in rows]
+    assert cases == [
+        (penalty, f"torchrl_l1, {precision}")
+        for penalty in fitting.DECAYS
+        for precision in fitting.PRECISIONS
+    ]
+    assert all(row["samples"] > 0 and math.isfinite(row["held_out"]) for row in rows)
 
 
 def test_plans_are_judged_in_pairs(small: None, monkeypatch) -> None:

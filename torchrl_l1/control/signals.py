@@ -185,7 +185,7 @@ def diagnose(
         matched=matched / config.dt,
         unmatched=unmatched / config.dt,
         u_a=torch.linalg.vector_norm(q, dim=-1, keepdim=True).clamp_max(torch.finfo(q.dtype).max),
-        saturation=_share((unbounded != u).masked_fill(non_finite, False), q.dtype),
+        saturation=_share((unbounded != u) & ~non_finite, q.dtype),
         ill_conditioned=ill_conditioned,
         non_finite=non_finite,
         **_significance(posterior, prediction_error),
