@@ -1,5 +1,7 @@
 """What a report over hundreds of runs takes: ``python -m benchmarks.report_runs [--runs 300]``.
 
+With ``--training`` the runs have no evaluations, whose figures are most of a report.
+
 The runs are copies of one tiny training, varied as those of a large study would be: tasks, L1,
 noise and seeds, 33 iterations each, a table of evaluations with the returns of single episodes.
 """
@@ -10,6 +12,7 @@ import argparse
 import csv
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -141,11 +144,15 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=RUNS)
     parser.add_argument("--repetitions", type=int, default=3)
     parser.add_argument("--output", type=Path, help="keep runs and report in this folder")
+    parser.add_argument("--training", action="store_true", help="no evaluations")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         place = options.output or Path(temporary)
         if not (place / "runs").exists():
             make_runs(place / "runs", options.runs)
+        if options.training:
+            for evaluations in (place / "runs").glob("*/*/*/evaluations"):
+                shutil.rmtree(evaluations)
         for _ in range(options.repetitions):
             found = measure(place / "runs", place / "report")
             print(", ".join(f"{value:.1f} {name}" for name, value in found.items()), flush=True)
