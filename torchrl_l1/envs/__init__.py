@@ -18,7 +18,7 @@ from torchrl_l1.envs.actuators import (
 )
 from torchrl_l1.envs.disturbances import RandomSigns, Uniform
 from torchrl_l1.envs.external import ExternalEnv, ExternalTask
-from torchrl_l1.envs.factory import disturbance_transforms, make_env
+from torchrl_l1.envs.factory import get_task, make_env
 from torchrl_l1.envs.gymnasium_env import MujocoTaskEnv
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
 from torchrl_l1.envs.perturbations import (
@@ -28,6 +28,7 @@ from torchrl_l1.envs.perturbations import (
     Disturbance,
     ObservationNoise,
     Perturbation,
+    disturbance_transforms,
     suite,
 )
 from torchrl_l1.envs.plant import disturbed_model, wind_force
@@ -36,7 +37,7 @@ from torchrl_l1.envs.sensors import SensorBias, SensorDelay, SensorDropout
 from torchrl_l1.envs.simulation import BatchedSimulator, StartStates, TaskSimulation
 from torchrl_l1.envs.sources import EnvironmentSource, environment_source, vector_environment
 from torchrl_l1.envs.task import AnyTask, BadAction, Task, action_bounds
-from torchrl_l1.envs.tasks import TASKS, get_task
+from torchrl_l1.envs.tasks import TASKS
 from torchrl_l1.registration import gymnasium_id, register_tasks
 
 register_tasks()

@@ -1,81 +1,68 @@
-"""One call from a task's name to an environment with noise, disturbances and controllers."""
+"""One call from a name to a task, or to an environment with noise, disturbances, controllers."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
+from torchrl_l1.envs.external import external_task
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
 from torchrl_l1.envs.perturbations import (
-    DISTURBANCES,
     ActionNoise,
-    Disturbance,
     ObservationNoise,
+    active_disturbances,
+    placed_transforms,
 )
 from torchrl_l1.envs.task import AnyTask, Task
-from torchrl_l1.envs.tasks import get_task
+from torchrl_l1.envs.tasks import TASKS, built_in_task, is_plain
 
 
-def _differs(value: Any, neutral: float) -> bool:
-    return callable(value) or bool((torch.as_tensor(value, dtype=torch.float64) != neutral).any())
-
-
-def _active(given: dict[str, Any]) -> list[tuple[Disturbance, Any]]:
-    """The disturbances that do something, with their values, in the order of the registry."""
-    known = {entry.setting: entry for entry in DISTURBANCES.values()}
-    values: dict[str, Any] = {}
-    for argument, value in given.items():
-        setting = DISTURBANCES[argument].setting if argument in DISTURBANCES else argument
-        if setting not in known:
-            raise TypeError(
-                f"make_env has no argument {argument!r}; its disturbances are {', '.join(known)}"
-            )
-        if setting in values:
-            raise TypeError(f"make_env got {setting!r} twice, by its setting and by its name")
-        values[setting] = value
-    return [
-        (entry, values[setting])
-        for setting, entry in known.items()
-        if setting in values and _differs(values[setting], entry.neutral)
-    ]
-
-
-def disturbance_transforms(**disturbances: Any) -> list[Transform]:
-    """The transforms of disturbances, in the order in which :func:`make_env` has them.
-
-    They go on any TorchRL environment that has ``action`` and ``observation``, before whatever
-    controls it.
+def get_task(
+    task: str | AnyTask,
+    *,
+    dt: float | None = None,
+    horizon: int | None = None,
+    observation_keys: Sequence[str] = (),
+    search_path: Sequence[str | Path] = (),
+) -> AnyTask:
+    """Look a task up by name; a task passes through.
 
     Args:
-        **disturbances: as of :func:`make_env`; neutral ones are left out.
+        task: a key of :data:`~torchrl_l1.envs.TASKS`, the name of any environment as
+            :func:`~torchrl_l1.envs.environment_source` takes it, or a task of your own.
+        dt: seconds of a step, where an environment of elsewhere does not tell.
+        horizon: steps of an episode, where an environment of elsewhere does not tell.
+        observation_keys: parts of the observation, where that of an environment comes in parts.
+        search_path: folders for files and modules that the name names.
+
+    Returns:
+        The task.
 
     Raises:
-        TypeError: for a disturbance that there is not, or that is given twice.
-        ValueError: for a change of the plant, which no transform can make, or a value that a
-            disturbance cannot have.
+        KeyError: if no task has this name; the message lists those that exist.
+        ValueError: for an environment that is not there or will not do, or that does not tell what
+            must be known.
 
     Examples:
-        >>> [type(transform).__name__ for transform in disturbance_transforms(gain=0.5, bias=0.3)]
-        ['ActuatorGain', 'ActuatorBias']
+        >>> get_task("half_cheetah").observation_dim
+        17
+        >>> get_task("gymnasium/Pendulum-v1").horizon
+        200
     """
-    active = _active(disturbances)
-    plant = [entry.name for entry, _ in active if entry.transform is None]
-    if plant:
-        raise ValueError(f"{', '.join(plant)}: a change of the plant is no transform, see make_env")
-    actuators, sensors = _placed(active)
-    return [*actuators, *sensors]
-
-
-def _placed(active: list[tuple[Disturbance, Any]]) -> tuple[list[Transform], list[Transform]]:
-    """Transforms of actions and of observations, each such that the registry's first acts first."""
-    placed: dict[str, list[Transform]] = {"action": [], "observation": []}
-    for entry, value in active:
-        if entry.transform is not None:
-            placed[entry.acts_on].append(entry.transform(value))
-    return placed["action"][::-1], placed["observation"]
+    if not isinstance(task, str):
+        return task
+    if task in TASKS or is_plain(task):
+        found = built_in_task(task)
+        if dt is not None and dt != found.dt:
+            raise ValueError(f"dt: a step of {task} takes {found.dt:g} s; leave dt out")
+        if observation_keys:
+            raise ValueError(f"observation_keys: the observation of {task} is one vector")
+        return found
+    return external_task(task, dt, horizon, tuple(observation_keys), tuple(search_path))
 
 
 def make_env(
@@ -138,8 +125,8 @@ def make_env(
         >>> env.rollout(10)["next", "reward"].shape
         torch.Size([4, 10, 1])
     """
-    active = _active(disturbances)
-    transforms, sensors = _placed(active)
+    active = active_disturbances(disturbances)
+    transforms, sensors = placed_transforms(active)
     if action_noise != 0:
         transforms.append(ActionNoise(action_noise))
     if observation_noise != 0:

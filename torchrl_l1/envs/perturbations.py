@@ -345,6 +345,71 @@ DISTURBANCES: Mapping[str, Disturbance] = disturbances_of(Perturbation)
 """By name: what evaluations vary, and training too where a recipe says so."""
 
 
+def _differs(value: Any, neutral: float) -> bool:
+    return callable(value) or bool((torch.as_tensor(value, dtype=torch.float64) != neutral).any())
+
+
+def active_disturbances(given: Mapping[str, Any]) -> list[tuple[Disturbance, Any]]:
+    """The disturbances that do something, with their values, in the order of the registry.
+
+    Raises:
+        TypeError: for a disturbance that there is not, or that is given twice.
+    """
+    known = {entry.setting: entry for entry in DISTURBANCES.values()}
+    values: dict[str, Any] = {}
+    for argument, value in given.items():
+        setting = DISTURBANCES[argument].setting if argument in DISTURBANCES else argument
+        if setting not in known:
+            raise TypeError(
+                f"make_env has no argument {argument!r}; its disturbances are {', '.join(known)}"
+            )
+        if setting in values:
+            raise TypeError(f"make_env got {setting!r} twice, by its setting and by its name")
+        values[setting] = value
+    return [
+        (entry, values[setting])
+        for setting, entry in known.items()
+        if setting in values and _differs(values[setting], entry.neutral)
+    ]
+
+
+def disturbance_transforms(**disturbances: Any) -> list[Transform]:
+    """The transforms of disturbances, in the order in which :func:`make_env` has them.
+
+    They go on any TorchRL environment that has ``action`` and ``observation``, before whatever
+    controls it.
+
+    Args:
+        **disturbances: as of :func:`make_env`; neutral ones are left out.
+
+    Raises:
+        TypeError: for a disturbance that there is not, or that is given twice.
+        ValueError: for a change of the plant, which no transform can make, or a value that a
+            disturbance cannot have.
+
+    Examples:
+        >>> [type(transform).__name__ for transform in disturbance_transforms(gain=0.5, bias=0.3)]
+        ['ActuatorGain', 'ActuatorBias']
+    """
+    active = active_disturbances(disturbances)
+    plant = [entry.name for entry, _ in active if entry.transform is None]
+    if plant:
+        raise ValueError(f"{', '.join(plant)}: a change of the plant is no transform, see make_env")
+    actuators, sensors = placed_transforms(active)
+    return [*actuators, *sensors]
+
+
+def placed_transforms(
+    active: list[tuple[Disturbance, Any]],
+) -> tuple[list[Transform], list[Transform]]:
+    """Transforms of actions and of observations, each such that the registry's first acts first."""
+    placed: dict[str, list[Transform]] = {"action": [], "observation": []}
+    for entry, value in active:
+        if entry.transform is not None:
+            placed[entry.acts_on].append(entry.transform(value))
+    return placed["action"][::-1], placed["observation"]
+
+
 def suite(name: str) -> list[dict[str, float]]:
     """The cells of a suite of disturbances: none first, then each value of each by itself.
 

@@ -27,9 +27,13 @@ from torchrl.envs import (
 )
 
 from torchrl_l1.control import time_step
-from torchrl_l1.envs.factory import disturbance_transforms, make_env
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
-from torchrl_l1.envs.perturbations import DISTURBANCES, Disturbance
+from torchrl_l1.envs.perturbations import (
+    DISTURBANCES,
+    Disturbance,
+    active_disturbances,
+    disturbance_transforms,
+)
 from torchrl_l1.envs.plant import disturbed_model
 from torchrl_l1.envs.references import find_attribute, load_module, making, require
 from torchrl_l1.envs.task import Task
@@ -93,7 +97,7 @@ class EnvironmentSource:
         """
         given = self._checked(disturbances or {})
         if self.task is not None:
-            return make_env(self.task, count, extra_transforms=control, seed=seed, **given)
+            return _simulated(self.task, count, given, control, seed)
         first = self._changed(given)
         base = first if first.batch_size else SerialEnv(count, lambda: self._changed(given))
         return _perturbed(base, given, control, seed)
@@ -115,7 +119,7 @@ class EnvironmentSource:
         """
         given = self._checked(disturbances or {})
         if self.task is not None:
-            return make_env(self.task, 1, extra_transforms=control, seed=seed, **given)
+            return _simulated(self.task, 1, given, control, seed)
         return _perturbed(self._changed(given, **options), given, control, seed)
 
     def _checked(self, disturbances: Mapping[str, float]) -> dict[str, Any]:
@@ -145,6 +149,19 @@ class EnvironmentSource:
     def time_step(self) -> float | None:
         """Time of one environment step in seconds, as far as the environment tells."""
         return self.task.dt if self.task is not None else time_step(self.build())
+
+
+def _simulated(
+    task: Task,
+    count: int,
+    disturbances: Mapping[str, float],
+    control: Sequence[Transform],
+    seed: int | None,
+) -> TransformedEnv:
+    changes = active_disturbances(disturbances)
+    plant = {entry.name: value for entry, value in changes if _of_plant(entry)}
+    base = BatchedMujocoEnv(task, count, seed=seed, plant=plant)
+    return _perturbed(base, disturbances, control, None)
 
 
 def _perturbed(

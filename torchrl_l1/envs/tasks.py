@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_l1.envs.task import AnyTask, Task
+from torchrl_l1.envs.task import Task
 from torchrl_l1.registration import EPISODE_STEPS
 
 # Swimmer: the front end of its head in the frame of the body "torso", metres along that body.
@@ -292,53 +291,6 @@ def built_in_task(task: str | Task) -> Task:
     if task not in TASKS:
         raise KeyError(f"Unknown task {task!r}. Available: {', '.join(sorted(TASKS))}")
     return TASKS[task]
-
-
-def get_task(
-    task: str | AnyTask,
-    *,
-    dt: float | None = None,
-    horizon: int | None = None,
-    observation_keys: Sequence[str] = (),
-    search_path: Sequence[str | Path] = (),
-) -> AnyTask:
-    """Look a task up by name; a task passes through.
-
-    Args:
-        task: a key of :data:`TASKS`, the name of any environment as
-            :func:`~torchrl_l1.envs.environment_source` takes it, or a task of your own.
-        dt: seconds of a step, where an environment of elsewhere does not tell.
-        horizon: steps of an episode, where an environment of elsewhere does not tell.
-        observation_keys: parts of the observation, where that of an environment comes in parts.
-        search_path: folders for files and modules that the name names.
-
-    Returns:
-        The task.
-
-    Raises:
-        KeyError: if no task has this name; the message lists those that exist.
-        ValueError: for an environment that is not there or will not do, or that does not tell what
-            must be known.
-
-    Examples:
-        >>> get_task("half_cheetah").observation_dim
-        17
-        >>> get_task("gymnasium/Pendulum-v1").horizon
-        200
-    """
-    if not isinstance(task, str):
-        return task
-    if task in TASKS or is_plain(task):
-        found = built_in_task(task)
-        if dt is not None and dt != found.dt:
-            raise ValueError(f"dt: a step of {task} takes {found.dt:g} s; leave dt out")
-        if observation_keys:
-            raise ValueError(f"observation_keys: the observation of {task} is one vector")
-        return found
-    # Not before it is needed: it stands on all that is above.
-    from torchrl_l1.envs.external import external_task
-
-    return external_task(task, dt, horizon, tuple(observation_keys), tuple(search_path))
 
 
 def is_plain(name: str) -> bool:
