@@ -1,9 +1,5 @@
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 import scipy.stats
@@ -195,27 +191,3 @@ def test_recovered_needs_the_same_episodes(on: list[np.ndarray]) -> None:
         recovered([np.zeros(3)], on, [np.zeros(3)])
     with pytest.raises(ValueError, match="the same episodes of the same policies"):
         recovered([], [], [])
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.lists(st.floats(-1e4, 1e4), min_size=10, max_size=30))
-def test_intervals_are_those_of_scipy_to_the_bit(values: list[float]) -> None:
-    def expected(statistic: Callable[..., Any], method: str) -> tuple[float, float]:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            found = scipy.stats.bootstrap(
-                (np.array(values),), statistic, n_resamples=9999, method=method, vectorized=True,
-                rng=np.random.default_rng(0),
-            ).confidence_interval  # fmt: skip
-        return float(found.low), float(found.high)
-
-    def middle(values: np.ndarray, axis: int) -> Any:
-        return scipy.stats.trim_mean(values, 0.25, axis=axis)
-
-    interval, corrected = mean_interval(values), expected(np.mean, "BCa")
-    if not np.isfinite(corrected).all():
-        corrected = expected(np.mean, "percentile")
-    assert interval is not None and (interval.low, interval.high) == corrected
-    interval = interquartile_interval(values)
-    assert interval is not None
-    assert (interval.low, interval.high) == expected(middle, "percentile")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtr, ndtri, stdtrit
+from scipy.stats import bootstrap, t, trim_mean
 
 from torchrl_l1.algorithms.facts import WINDOW
 
@@ -67,11 +68,7 @@ def interquartile_mean(values: np.ndarray | Sequence[float], axis: int = 0) -> A
         >>> float(interquartile_mean([-100.0, 1.0, 3.0, 100.0]))
         2.0
     """
-    array = np.asarray(values, dtype=np.float64)
-    count = array.shape[axis]
-    cut = count // 4
-    ordered = np.partition(array, (cut, count - cut - 1), axis)
-    return ordered.take(range(cut, count - cut), axis).mean(axis)
+    return trim_mean(values, 0.25, axis=axis)
 
 
 def mean_interval(values: Sequence[float]) -> Interval | None:
@@ -99,9 +96,8 @@ def mean_interval(values: Sequence[float]) -> Interval | None:
     if count < MIN_SAMPLES:
         return None
     if count >= _MIN_BOOTSTRAP:
-        return _bootstrap(values, np.mean, corrected=True) or _bootstrap(values, np.mean)
-    mean = np.mean(values)
-    half = stdtrit(count - 1, 0.975) * np.std(values, ddof=1) / count**0.5
+        return _bootstrap(values, np.mean, "BCa") or _bootstrap(values, np.mean, "percentile")
+    mean, half = np.mean(values), t.ppf(0.975, count - 1) * np.std(values, ddof=1) / count**0.5
     return Interval(float(mean - half), float(mean + half))
 
 
@@ -117,7 +113,7 @@ def interquartile_interval(values: Sequence[float]) -> Interval | None:
     """
     if len(values) < MIN_INTERQUARTILE:
         return None
-    return _bootstrap(values, interquartile_mean)
+    return _bootstrap(values, interquartile_mean, "percentile")
 
 
 def mean_summary(name: str, values: Sequence[float]) -> dict[str, Any]:
@@ -235,57 +231,20 @@ def _percentiles(values: np.ndarray) -> Interval:
 
 
 def _bootstrap(
-    values: Sequence[float], statistic: Callable[..., Any], corrected: bool = False
+    values: Sequence[float], statistic: Callable[..., Any], method: str
 ) -> Interval | None:
-    """As ``scipy.stats.bootstrap``, to the bit, whose package takes long to load.
-
-    Args:
-        values: the sample.
-        statistic: takes ``axis``.
-        corrected: whether by the bias-corrected and accelerated method, or by plain percentiles.
-
-    Returns:
-        the interval, or ``None`` where it is not defined.
-    """
-    sample = np.asarray(values, dtype=np.float64)
-    resampled = np.sort(statistic(sample[_draws(len(sample))], axis=-1))
-    tail = (1 - 0.95) / 2
-    with np.errstate(all="ignore"):
-        places = _corrected(sample, statistic, resampled, tail) if corrected else (tail, 1 - tail)
-        limits = [_quantile(resampled, float(place)) for place in places]
-    return Interval(*limits) if np.isfinite(limits).all() else None
-
-
-@cache
-def _draws(count: int) -> np.ndarray:
-    """Indices ``(resamples, count)`` of what is drawn from a sample, the same every time."""
-    return np.random.default_rng(0).integers(0, count, (_RESAMPLES, count))
-
-
-def _corrected(
-    sample: np.ndarray, statistic: Callable[..., Any], resampled: np.ndarray, tail: float
-) -> tuple[float, float]:
-    """Where the limits are among resampled statistics: Efron and Tibshirani, 14.3."""
-    count = len(sample)
-    value = statistic(sample, axis=-1)
-    below = np.count_nonzero(resampled < value) + np.count_nonzero(resampled <= value)
-    bias = ndtri(below / (2 * len(resampled)))
-    others = np.broadcast_to(sample, (count, count))[~np.eye(count, dtype=bool)]
-    left_out = statistic(others.reshape(count, count - 1), axis=-1)
-    influence = (count - 1) * (left_out.mean() - left_out)
-    cubes, squares = (np.sum(influence**power) / count**power for power in (3, 2))
-    acceleration = 1 / 6 * cubes / squares**1.5
-    low, high = (
-        ndtr(bias + moved / (1 - acceleration * moved))
-        for moved in (bias + ndtri(tail), bias - ndtri(tail))
-    )
-    return float(low), float(high)
-
-
-def _quantile(ordered: np.ndarray, place: float) -> float:
-    """Between two of some ordered values, linearly; NaN for a place that is none."""
-    if not 0 <= place <= 1:
-        return float("nan")
-    whole, part = divmod(place * len(ordered) + (1 - place), 1)
-    low, high = (min(max(int(whole) + step, 0), len(ordered) - 1) for step in (-1, 0))
-    return float((1 - part) * ordered[low] + part * ordered[high])
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        # That BCa is not defined is seen from its result.
+        warnings.simplefilter("ignore")
+        interval = bootstrap(
+            (np.asarray(values, dtype=np.float64),),
+            statistic,
+            n_resamples=_RESAMPLES,
+            confidence_level=0.95,
+            method=method,
+            vectorized=True,
+            rng=np.random.default_rng(0),
+        ).confidence_interval
+    if not (np.isfinite(interval.low) and np.isfinite(interval.high)):
+        return None
+    return Interval(float(interval.low), float(interval.high))
