@@ -7,14 +7,16 @@ import runpy
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
-from typing import IO, Protocol
+from typing import Any, Protocol
 
 import pytest
 from omegaconf import DictConfig
+
+from tests.forked import asked_for
 
 TINY = [
     "outer_iterations=2",
@@ -123,19 +125,9 @@ class Forked(Started):
         )
 
 
-def forked_worker(
-    command: Sequence[str],
-    *,
-    stdin: int,
-    stdout: IO[bytes],
-    stderr: int,
-    env: Mapping[str, str],
-    start_new_session: bool,
-) -> Forked:
+def forked_worker(command: Sequence[str], **options: Any) -> Forked:
     """As much of ``subprocess.Popen`` as a campaign in this process needs for its workers."""
-    interpreter, option, module, *arguments = command
-    assert (interpreter, option) == (sys.executable, "-m")
-    assert (stdin, stderr) == (subprocess.DEVNULL, subprocess.STDOUT) and start_new_session
+    module, arguments, stdout, _ = asked_for(command, **options)
     path = [os.getcwd(), *SEARCH_PATH]
     return Forked(arguments, Path(stdout.name), path, module, worker=True)
 

@@ -17,7 +17,7 @@ import traceback
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from types import SimpleNamespace
-from typing import IO, ClassVar
+from typing import IO, Any, ClassVar
 
 
 class Fork:
@@ -29,19 +29,8 @@ class Fork:
 
     kept: ClassVar[set[int]] = set()
 
-    def __init__(
-        self,
-        command: Sequence[str],
-        *,
-        stdin: int,
-        stdout: IO[bytes],
-        stderr: int,
-        env: Mapping[str, str],
-        start_new_session: bool,
-    ) -> None:
-        interpreter, option, module, *arguments = command
-        assert (interpreter, option) == (sys.executable, "-m")
-        assert (stdin, stderr) == (subprocess.DEVNULL, subprocess.STDOUT) and start_new_session
+    def __init__(self, command: Sequence[str], **options: Any) -> None:
+        module, arguments, stdout, env = asked_for(command, **options)
         self.status: int | None = None
         self.pid = os.fork()
         if self.pid == 0:
@@ -67,6 +56,22 @@ class Fork:
             _, status = os.waitpid(self.pid, 0)
             self.status = os.waitstatus_to_exitcode(status)
         return self.status
+
+
+def asked_for(
+    command: Sequence[str],
+    *,
+    stdin: int,
+    stdout: IO[bytes],
+    stderr: int,
+    env: Mapping[str, str],
+    start_new_session: bool,
+) -> tuple[str, list[str], IO[bytes], Mapping[str, str]]:
+    """Module, arguments, output and environment of what a campaign asks ``Popen`` for."""
+    interpreter, option, module, *arguments = command
+    assert (interpreter, option) == (sys.executable, "-m")
+    assert (stdin, stderr) == (subprocess.DEVNULL, subprocess.STDOUT) and start_new_session
+    return module, arguments, stdout, env
 
 
 def open_descriptors() -> set[int]:
