@@ -348,3 +348,48 @@ def test_a_disturbance_of_actuators_at_their_bounds_is_found_whether_cut_off_or_
         x = x + (jacobian @ force.unsqueeze(-1)).squeeze(-1) + noise
     torch.testing.assert_close(state.sigma_m.mean(0), bias, atol=0.05, rtol=0)
     assert state.noise.mean() < 1.5
+
+
+def test_a_push_inwards_counts_where_it_is_beyond_noise():
+    reach = Reach.of(
+        L1Config.robust(0.05, **BOUNDS),
+        torch.tensor([1.0, 1.0, 1.0, -1.0, -1.0, 0.0]),
+        Posterior(torch.tensor([0.3, 0.3, 0.3, -0.3, 0.0, 0.3]), 0.01 * torch.eye(6)),
+    )
+    assert reach.within.tolist() == [False] * 5 + [True]
+    pushes = torch.tensor([-1.1, -0.9, 5.0, 1.1, -5.0, -5.0])  # standard deviations
+    for length in (1e-3, 1.0, 1e3):
+        counted = reach.counting(length * torch.eye(6), pushes)
+        assert counted.within.tolist() == [True, False, False, True, False, True]
+        assert counted.deviation.bool().tolist() == (~counted.within).tolist()
+        torch.testing.assert_close(counted.passed, reach.passed)
+    nothing = reach.counting(torch.zeros(6, 6), torch.full((6,), torch.nan))
+    assert nothing.within.equal(reach.within)
+
+
+@pytest.mark.parametrize("first", [0.4, -0.4])
+@pytest.mark.parametrize("law", ["dead zone", "gain"])
+def test_actuators_that_push_too_little_at_both_bounds_do_not_mislead(law, first):
+    generator = torch.Generator().manual_seed(6)
+    batch, steps, n = 20, 600, 3
+    config = L1Config.robust(0.05, **BOUNDS, dead_zone=1e6)
+    statistics = ResidualStatistics(0.02**2 * torch.eye(n), 1.0, 0.003)
+    state = init([batch], n, 1, config)
+    x = torch.zeros(batch, n)
+    for index in range(steps):
+        jacobian = 0.1 * torch.randn(batch, n, 1, generator=generator)
+        # At both bounds in nine steps of ten.
+        u_rl = (10 * torch.randn(batch, 1, generator=generator)).clamp(-1, 1)
+        u, state, _ = step(
+            config, state, x, u_rl, torch.zeros_like(x), jacobian, residuals=statistics
+        )
+        if index < 50:  # a bias comes first, in whose sign the estimate is sure
+            force = u + first
+        elif law == "gain":
+            force = 0.6 * u
+        else:
+            force = u.sign() * (u.abs() - 0.3).clamp_min(0)
+        noise = 0.02 * torch.randn(batch, n, generator=generator)
+        x = x + (jacobian @ force.unsqueeze(-1)).squeeze(-1) + noise
+    # The mean over both bounds is zero, the push of 0.3 or 0.4 at either is what may mislead.
+    assert state.sigma_m.mean().abs() < 0.15

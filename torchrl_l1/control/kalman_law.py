@@ -25,6 +25,13 @@ from torchrl_l1.control.signals import (
 )
 from torchrl_l1.control.state import L1State, ResidualStatistics
 
+CONTRADICTION = 1.0
+"""Standard deviations beyond which a push inwards at a bound is taken for no noise.
+
+Of the inflated covariance, of which ordinary residuals are well within. More would leave weak
+evidence out; with less, noise at the bounds draws the estimate of a bias towards zero.
+"""
+
 
 class Estimate(NamedTuple):
     """What the Kalman filter knows before it says what to do.
@@ -53,18 +60,22 @@ class Reach(NamedTuple):
     Whether they do is not known: a bias of a motor's command is cut off by the motor's limit, a
     load on its axis is not. What would lie beyond is expected to be cut off, as in most
     simulators, and may be there all the same: no reason to take it for noise, and none to learn
-    from it.
+    from it. A push inwards is of another kind: no disturbance beyond a bound explains it, see
+    :meth:`counting`.
 
     Attributes:
         passed: what of the mean stays within the bounds ``(..., m)``, action units.
         within: entries whose whole effect is sure ``(..., m)``, bool.
         deviation: standard deviation of what comes beside ``passed`` in the others, if anything
             does, ``(..., m)``; zero for those within.
+        outward: the direction of the bound, one or minus one ``(..., m)``; of no meaning for those
+            within.
     """
 
     passed: Tensor
     within: Tensor
     deviation: Tensor
+    outward: Tensor
 
     @classmethod
     def of(cls, config: L1Config, executed: Tensor, posterior: Posterior) -> Reach:
@@ -75,11 +86,29 @@ class Reach(NamedTuple):
         # No smaller than rounding: actions without bounds may be large.
         rounding = 64 * torch.finfo(mean.dtype).eps * both.abs()
         margin = 1e-3 * like(mean, config.half_range) + rounding
+        above, below = saturate(config, both + margin), saturate(config, both - margin)
         # Rounding may take some of twice the margin, a bound takes at least half.
-        span = saturate(config, both + margin) - saturate(config, both - margin)
-        within = span > 1.5 * margin
+        within = above - below > 1.5 * margin
+        outward = ((both - below) - (above - both)).sign()
         variance = posterior.covariance.diagonal(dim1=-2, dim2=-1) + (mean - passed).square()
-        return cls(passed, within, variance.sqrt().masked_fill(within, 0.0))
+        return cls(passed, within, variance.sqrt().masked_fill(within, 0.0), outward)
+
+    def counting(self, columns: Tensor, innovation: Tensor) -> Reach:
+        r"""With those entries within whose actuator is pushed inwards, against the expectation.
+
+        Where actuators push too little at both bounds, as under a dead zone or a lower gain, the
+        steps at one bound alone would confirm whichever sign the estimate took first. Such are
+        entries with :math:`z_i = (C^\top r)_i / \sqrt{(C^\top C)_{ii}}` of more than
+        :data:`CONTRADICTION` inwards.
+
+        Args:
+            columns: whitened input matrix :math:`C` ``(..., n, m)``.
+            innovation: whitened :math:`r` ``(..., n)``.
+        """
+        score = (columns.mT @ innovation.unsqueeze(-1)).squeeze(-1)
+        length = torch.linalg.vector_norm(columns, dim=-2)
+        within = self.within | (self.outward * score < -CONTRADICTION * length)
+        return self._replace(within=within, deviation=self.deviation.masked_fill(within, 0.0))
 
 
 def estimate(
@@ -101,8 +130,8 @@ def estimate(
         w_t \sim N(0, D_t \Lambda D_t)
 
     where the input and what adds to it stay within the bounds of the action; what lies beyond may
-    reach the plant or not, see :class:`Reach`. Here :math:`\Lambda` is the inflated covariance of
-    the residuals. The squares of the diagonal
+    reach the plant or not, and counts only where it is contradicted, see :class:`Reach`. Here
+    :math:`\Lambda` is the inflated covariance of the residuals. The squares of the diagonal
     :math:`D_t` are a running mean of :func:`~.kalman.noise_ratio`, none below one, times their
     mean over the states: a state whose sensor has become noisy loses its weight, and all do where
     many have. A single residual beyond expectation loses it at once, see
@@ -135,12 +164,7 @@ def estimate(
         ),
     )
     seen = state.jacobian.masked_fill(fresh, 0.0).unflatten(-1, (n, m))
-    reach = Reach.of(config, state.u_bar, prior)
-    jacobian = seen * reach.within.unsqueeze(-2)
-    unknown = seen * reach.deviation.unsqueeze(-2)
     innovation = (observation - state.x_hat).masked_fill(fresh, 0.0)
-    expected = (jacobian @ prior.mean.unsqueeze(-1)).squeeze(-1)
-    residual = innovation + expected
 
     covariance = _expected_covariance(config, state, statistics, fresh)
     noise = state.noise.masked_fill(fresh, 1.0)
@@ -148,10 +172,14 @@ def estimate(
     # From observations that are noisier than its data were, a model errs in a lasting way too: the
     # policy reacts to the noise, and the mean of a nonlinear function is not that of its argument.
     scale = (larger * larger.mean(-1, keepdim=True)).sqrt().unsqueeze(-1)
-    unknown = unknown / scale
-    columns, white = whitened(
-        covariance + unknown @ unknown.mT, jacobian / scale, innovation.unsqueeze(-1) / scale
-    )
+    relative = innovation.unsqueeze(-1) / scale
+    columns, white = whitened(covariance, seen / scale, relative)
+    reach = Reach.of(config, state.u_bar, prior).counting(columns, white.squeeze(-1))
+    jacobian = seen * reach.within.unsqueeze(-2)
+    unknown = seen * reach.deviation.unsqueeze(-2)
+    residual = innovation + (jacobian @ prior.mean.unsqueeze(-1)).squeeze(-1)
+    others = unknown / scale
+    columns, white = whitened(covariance + others @ others.mT, jacobian / scale, relative)
     white = white.squeeze(-1)
     factor = kalman.factor(prior.covariance)
     posterior = kalman.measurement_update(prior, columns, white, factor)
@@ -161,7 +189,7 @@ def estimate(
         columns, white = columns / doubt.unsqueeze(-1), white / doubt
         posterior = kalman.measurement_update(prior, columns, white, factor)
         left = residual - (jacobian @ posterior.mean.unsqueeze(-1)).squeeze(-1)
-        ratio = kalman.noise_ratio(covariance, jacobian, posterior, left, unknown * scale)
+        ratio = kalman.noise_ratio(covariance, jacobian, posterior, left, unknown)
         noise = torch.where(fresh, noise, torch.lerp(ratio, noise, config.forgetting))
 
     flat = posterior.covariance.flatten(-2)
