@@ -13,7 +13,7 @@ from torchrl.envs import DoubleToFloat, EnvBase, GymEnv, SerialEnv, TransformedE
 
 from benchmarks.tables import Table
 from benchmarks.timing import Row, interleave, spread, undisturbed_clock
-from torchrl_l1.control import L1Config, L1Transform, time_step
+from torchrl_l1.control import L1Config, L1State, L1Transform, time_step
 from torchrl_l1.control.seal import SEAL, seal_width
 from torchrl_l1.dynamics import EnsembleDynamics
 
@@ -44,7 +44,9 @@ PAIRS = 10
 class Unsealed(L1Transform):
     """L1 with seals that are zero, and not looked at."""
 
-    def _seal(self, nested: TensorDictBase, observation: Tensor) -> None:
+    def _seal(
+        self, nested: TensorDictBase, observation: Tensor, state: L1State | None = None
+    ) -> None:
         layout = self._resolve()
         width = seal_width(
             layout.observation_dim, layout.action_dim, "covariance" in self._state_names

@@ -364,7 +364,7 @@ class L1Controller(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """One step of the controller, see the class."""
-        u_rl, executed, following = advance(
+        ahead = advance(
             self._prepared(),
             self._state_names,
             tensordict,
@@ -378,9 +378,9 @@ class L1Controller(TensorDictModuleBase):
             emitted=self._environment.emitted,
             seal_is_required=False,
         )
-        tensordict.set((self.key, "u_rl"), u_rl)
-        tensordict.set(self.action_key, executed)
-        tensordict.set(("next", self.key), following)
+        tensordict.set((self.key, "u_rl"), ahead.u_rl)
+        tensordict.set(self.action_key, ahead.executed)
+        tensordict.set(("next", self.key), ahead.following)
         return tensordict
 
     def _prepared(self) -> StepFunction:

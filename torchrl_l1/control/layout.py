@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -211,6 +211,24 @@ def as_action_jacobian(
     )
 
 
+class Advanced(NamedTuple):
+    """What :func:`advance` read and found.
+
+    Attributes:
+        u_rl: the policy's action, in its type.
+        executed: the executed input, in that type.
+        following: nested tensordict of what follows.
+        state: that is in it.
+        seal: that was read, if any.
+    """
+
+    u_rl: Tensor
+    executed: Tensor
+    following: TensorDict
+    state: L1State
+    seal: Tensor | None
+
+
 def advance(
     step: StepFunction,
     names: Sequence[str],
@@ -224,7 +242,7 @@ def advance(
     check: bool = True,
     emitted: Emitted | None = None,
     seal_is_required: bool = True,
-) -> tuple[Tensor, Tensor, TensorDict]:
+) -> Advanced:
     """Read a step's inputs, the state's entries of those names among them, and take the step.
 
     Args:
@@ -241,8 +259,11 @@ def advance(
         seal_is_required: whether there must be a seal.
 
     Returns:
-        the policy's action, the executed input (both in the action's type) and the nested
-        tensordict of what follows.
+        what was read and what follows.
+
+    Raises:
+        KeyError: if an entry is missing.
+        ValueError: if one has another shape, or is not what was sealed.
     """
     observation = required_entry(tensordict, observation_key, owner)
     action = required_entry(tensordict, action_key, owner)
@@ -293,7 +314,7 @@ def advance(
         executed, state, signals = step(state, observation.to(dtype), action.to(dtype))
     executed = executed.to(action.dtype)
     following = pack(executed, state, signals, tensordict.batch_size, tensordict.device)
-    return action, executed, following
+    return Advanced(action, executed, following, state, seal)
 
 
 def required_entry(tensordict: TensorDictBase, key: NestedKey, owner: str) -> Tensor:

@@ -35,14 +35,18 @@ def sealed(observation: Tensor, state: L1State) -> Tensor:
 
     Of a Kalman filter's memory, which is wide, it is the sum.
     """
-    # Every operation counts here: at a batch of one each costs as much as a thousand sums.
+    # Every operation counts here: at a batch of one each costs as much as a thousand sums, and
+    # joining several types as much as three.
     x_hat, u_bar, q, sigma_m, n_switch, started, *_ = state
-    parts = [observation.to(x_hat.dtype), x_hat, u_bar, q, sigma_m, n_switch, started]
+    dtype = x_hat.dtype
+    flags = n_switch.to(dtype), started.to(dtype)
+    parts = [observation.to(dtype), x_hat, u_bar, q, sigma_m, *flags]
     if state.covariance is not None:
         parts.append(torch.cat(_memory(state), -1).sum(-1, keepdim=True))
     # What is not finite is a number of its own here: whoever looks at the entries finds none.
-    largest = min(torch.finfo(x_hat.dtype).max, _LARGEST)
-    return torch.cat(parts, -1).nan_to_num(0.9 * largest, largest, -largest).detach()
+    largest = min(torch.finfo(dtype).max, _LARGEST)
+    seal = torch.cat(parts, -1).nan_to_num(0.9 * largest, largest, -largest)
+    return seal.detach() if seal.requires_grad else seal
 
 
 _NARROW = L1State._fields.index("covariance")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -16,7 +17,14 @@ from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control.affine import StepFunction, make_step
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import Predicts
-from torchrl_l1.control.layout import L1_KEY, Dynamics, Layout, advance, as_action_jacobian
+from torchrl_l1.control.layout import (
+    L1_KEY,
+    Advanced,
+    Dynamics,
+    Layout,
+    advance,
+    as_action_jacobian,
+)
 from torchrl_l1.control.pipeline import (
     Settings,
     carry,
@@ -28,6 +36,25 @@ from torchrl_l1.control.pipeline import (
 )
 from torchrl_l1.control.seal import SEAL, Emitted, sealed
 from torchrl_l1.control.state import L1Diagnostics, L1State, state_names
+
+
+@dataclass
+class _Last:
+    """What is remembered from one call to the next, of one process.
+
+    Not the module's own attributes, of which setting one costs as much as a small kernel.
+
+    Attributes:
+        ahead: what the step that is under way has found.
+        emitted: what was sealed last.
+        consumed: the seal from which the last step was taken.
+        repeats: how often it was taken again.
+    """
+
+    ahead: Advanced | None = None
+    emitted: Emitted | None = None
+    consumed: Tensor | None = None
+    repeats: int = 0
 
 
 class L1Transform(Transform):
@@ -139,9 +166,7 @@ class L1Transform(Transform):
         self._is_ready = self._is_stateful = False
         self._step_config: L1Config | None = None
         self._step_function: StepFunction | None = None
-        self._emitted: Emitted | None = None
-        self._consumed: Tensor | None = None
-        self._repeats = 0
+        self._last = _Last()
         self._lacking: list[str] | None = None
 
     @property
@@ -171,7 +196,7 @@ class L1Transform(Transform):
 
     def _forget(self) -> None:
         self._layout = self._zero = None
-        self._emitted = self._consumed = None
+        self._last = _Last()
         self._lacking = None
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
@@ -211,7 +236,7 @@ class L1Transform(Transform):
                 "step, as FrameSkipTransform does; it must come before L1Transform in Compose"
             )
         assert self._step_function is not None
-        _, executed, following = advance(
+        ahead = advance(
             self._step_function,
             self._state_names,
             tensordict,
@@ -221,40 +246,45 @@ class L1Transform(Transform):
             owner="L1Transform",
             remedy="reset the environment first and pass on what reset or step_mdp returned",
             check=self.check,
-            emitted=self._emitted,
+            emitted=self._last.emitted,
         )
         if self.check and not torch.compiler.is_compiling():
-            self._check_repeated(tensordict)
+            self._check_repeated(ahead.seal)
+        # What is at hand need not be read again.
+        self._last.ahead = None if torch.compiler.is_compiling() else ahead
         # The caller's tensordict keeps the policy's action: this one is a shallow copy.
-        tensordict.set(self.action_key, executed)
-        return tensordict.set(self._pending, following)
+        tensordict.set(self.action_key, ahead.executed)
+        return tensordict.set(self._pending, ahead.following)
 
-    def _check_repeated(self, tensordict: TensorDictBase) -> None:
+    def _check_repeated(self, seal: Tensor | None) -> None:
         """Refuse to go on where each step was taken twice, as by a FrameSkipTransform around."""
-        seal, emitted, consumed = tensordict.get((self.key, SEAL)), self._emitted, self._consumed
-        if emitted is None or not self._is_stateful:
+        last = self._last
+        if seal is None or last.emitted is None or not self._is_stateful:
             return
-        if seal is emitted.seal or _equal(seal, emitted.seal):
-            if self._repeats:
+        if seal is last.emitted.seal or _equal(seal, last.emitted.seal):
+            if last.repeats:
                 raise ValueError(
-                    f"L1Transform stepped {self._repeats + 1} times from one state before it came "
+                    f"L1Transform stepped {last.repeats + 1} times from one state before it came "
                     "to the next: put what repeats the action, such as FrameSkipTransform, before "
                     "it in Compose"
                 )
-            self._consumed = seal if seal is emitted.seal else seal.clone()
-        elif consumed is not None and _equal(seal, consumed):
-            self._repeats += 1
+            last.consumed = seal if seal is last.emitted.seal else seal.clone()
+        elif last.consumed is not None and _equal(seal, last.consumed):
+            last.repeats += 1
         else:
-            self._consumed, self._repeats = seal.clone(), 0
+            last.consumed, last.repeats = seal.clone(), 0
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         following = tensordict.get(self._pending)
+        ahead, self._last.ahead = self._last.ahead, None
+        state = ahead.state if ahead is not None and ahead.following is following else None
         stepped = tensordict.get("_step", None)
         if stepped is not None:
             previous = tensordict.get(self.key).select(*following.keys(), strict=False)
             following = following.where(stepped.reshape(following.batch_size), previous, pad=0)
+            state = None
         # Environments may go on without being asked: the seal is on what came out.
-        self._seal(following, next_tensordict.get(self.observation_key))
+        self._seal(following, next_tensordict.get(self.observation_key), state)
         return next_tensordict.set(self.key, following)
 
     def _reset(
@@ -262,7 +292,7 @@ class L1Transform(Transform):
     ) -> TensorDictBase:
         # Partial resets are merged by the environment, which discards the rows not reset.
         self._complete()
-        self._repeats = 0
+        self._last.repeats = 0
         observation = tensordict_reset.get(self.observation_key)
         self._check_finite(observation, tensordict.get("_reset", None))
         return tensordict_reset.set(self.key, self._fresh(tensordict_reset))
@@ -302,13 +332,17 @@ class L1Transform(Transform):
         self._seal(fresh, tensordict_reset.get(self.observation_key))
         return fresh
 
-    def _seal(self, nested: TensorDictBase, observation: Tensor) -> None:
-        found = dict(nested.items())
-        state = L1State(**{name: found[name] for name in self._state_names})
+    def _seal(
+        self, nested: TensorDictBase, observation: Tensor, state: L1State | None = None
+    ) -> None:
+        """Write the seal beside the state, which is read there if not given."""
+        if state is None:
+            found = dict(nested.items())
+            state = L1State(**{name: found[name] for name in self._state_names})
         seal = sealed(observation, state)
         nested.set(SEAL, seal)
         if not torch.compiler.is_compiling():
-            self._emitted = Emitted.of(observation, state, seal)
+            self._last.emitted = Emitted.of(observation, state, seal)
 
     def _resolve(self) -> Layout:
         if self._layout is None:
@@ -372,8 +406,7 @@ class L1Transform(Transform):
             "_step_function": None,
             "_layout": None,
             "_zero": None,
-            "_emitted": None,
-            "_consumed": None,
+            "_last": _Last(),
             "_lacking": None,
         }
         return super().__getstate__() | empty
