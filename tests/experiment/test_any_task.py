@@ -108,15 +108,23 @@ def test_a_file_beside_the_recipe_is_found_from_everywhere(
     capsys.readouterr()
 
 
-@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+LAUNCHERS = {
+    "basic": [],
+    "joblib": ["hydra.launcher.n_jobs=2"],
+    "submitit_local": ["hydra.launcher.timeout_min=5"],
+    "ray": ["+hydra.launcher.ray.init.num_cpus=2"],
+}
+
+
+@pytest.mark.parametrize("launcher", LAUNCHERS)
 def test_sweeps_over_packages_functions_and_files(
     launcher: str, place: Path, start_cli: Callable[..., Process]
 ) -> None:
     """In a process of its own, whose path does not have the folder, and in the launcher's."""
-    if launcher == "joblib":
-        pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    if launcher != "basic":
+        pytest.importorskip(f"hydra_plugins.hydra_{launcher.partition('_')[0]}_launcher")
     tasks = ",".join(NAMES)
-    more = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"] if launcher == "joblib" else []
+    more = [f"hydra/launcher={launcher}", *LAUNCHERS[launcher]]
     arguments = ["run", "pets/any", "-m", f"task={tasks}", "reward=rafts:reward", *TINY, *more]
     assert str(place) not in sys.path
     assert start_cli(arguments).wait() == 0, (place / "output").read_text()
