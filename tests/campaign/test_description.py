@@ -281,9 +281,9 @@ def test_shipped_campaigns_are_the_papers(capsys: pytest.CaptureFixture[str]) ->
             # 50 000 and 204 000 real steps; clipping asks no question of the paper's.
             iterations = 9 if name == "clipping" else 19 if "pendulum" in matrix.recipe else 33
             assert f"outer_iterations={iterations}" in matrix.overrides
-    assert sizes["table1"] == 5 * 3 * 2 * 10
+    assert sizes["table1"] == 3 * 3 * 10 + 4 * (3 * 5 + 2 * 3 * 3)
     assert sizes["table1_first"] == 3 * 2 * 5 + 2 * 4 + 2 * 2
-    assert sizes["figure2"] == 3 * 3 + 3 * 2
+    assert sizes["figure2"] == 3 * 3 + 3 * 4
     assert sizes["pets"] == 2 * 2 * 2 * 5
     assert sizes["mbmf"] == 3 * 2 * 5 + 2 * 2 * 2
     assert sizes["mbmf_rest"] == 2 * 2 * 2 * 2 + 2 * 3 * 2 * 2

@@ -376,7 +376,10 @@ def without_newer(settings: DictConfig) -> DictConfig:
     algorithm = settings.get("algorithm")
     # Planners have had a precision of their own all along, and offline learning has had both.
     had = {"metrpo": (), "offline": ("precision", "fit.precision")}.get(algorithm, ("precision",))
-    for name in [n for n in NEWER if n not in had] if algorithm is not None else []:
+    # The robust controller is newer as a whole.
+    kept = "l1." if OmegaConf.select(settings, "l1.filter") == "kalman" else "nothing"
+    newer = [n for n in NEWER if n not in had and not n.startswith(kept)]
+    for name in newer if algorithm is not None else []:
         assert OmegaConf.select(older, name) == NEWER[name]
         parent, _, key = name.rpartition(".")
         del (OmegaConf.select(older, parent) if parent else older)[key]
