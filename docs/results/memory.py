@@ -1,4 +1,4 @@
-"""Memory of a process that steps 4096 environments through L1: does it grow?
+"""Memory of a process that steps 4096 inverted pendulums through L1: does it grow?
 
     python docs/results/memory.py [STEPS]
 
@@ -25,6 +25,7 @@ from torchrl_l1.experiment.files import write_table
 
 HERE = Path(__file__).parent
 ENVIRONMENTS = 4096
+TASK = "inverted_pendulum"  # its simulation takes the least time
 CONTROLLERS = ("off", "paper", "robust")
 EVERY = 20
 
@@ -37,7 +38,7 @@ def resident_mebibytes() -> float:
 
 def controller(name: str) -> list[L1Transform]:
     """The transforms of one of the arms, with a small model that has seen no data."""
-    task = get_task("half_cheetah")
+    task = get_task(TASK)
     bounds = {"action_low": task.action_low, "action_high": task.action_high}
     if name == "off":
         return []
@@ -50,7 +51,7 @@ def measure(name: str, steps: int) -> list[dict[str, float | str]]:
     """The resident set every few steps."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    env = make_env("half_cheetah", ENVIRONMENTS, seed=0, extra_transforms=controller(name))
+    env = make_env(TASK, ENVIRONMENTS, seed=0, extra_transforms=controller(name))
     policy = RandomPolicy(env.full_action_spec)
     rows: list[dict[str, float | str]] = []
     with torch.no_grad():
