@@ -4,8 +4,9 @@
 
 Reads the tables that `torchrl-l1 evaluate` wrote into FOLDER/TASK/seed_N/bias and .../noise, if a
 FOLDER is given, and keeps their episodes in `robust/TASK.csv` beside this file, in place of those
-of the same policy. Writes from those `robust/TASK.md`, `robust/TASK.png`, `robust/overall.md` and
-`robust/harm.md`.
+of the same policy.More episodes without a disturbance, of tasks whose returns scatter much, are
+in .../undisturbed and are kept in `robust/undisturbed_TASK.csv`. Writes from those
+`robust/TASK.md`, `robust/TASK.png`, `robust/overall.md` and `robust/harm.md`.
 """
 
 from __future__ import annotations
@@ -42,15 +43,15 @@ def read(file: Path) -> list[Row]:
         ]
 
 
-def gather(folder: Path, task: str) -> None:
+def gather(folder: Path, task: str, parts: Sequence[str], kept: Path) -> None:
     """Keep the episodes of all seeds and controllers of a task in one file, the new in place."""
     rows = []
     for file in sorted(folder.glob(f"{task}/seed_*/*/episodes.csv")):
-        rows += [{**row, "run": file.parts[-3]} for row in read(file)]
+        if file.parent.name in parts:
+            rows += [{**row, "run": file.parts[-3]} for row in read(file)]
     if not rows:
         return
     HERE.mkdir(exist_ok=True)
-    kept = HERE / f"{task}.csv"
     new = {(row["run"], row["l1"]) for row in rows}
     before = read(kept) if kept.exists() else []
     old = [row for row in before if (row["run"], row["l1"]) not in new]
@@ -151,9 +152,10 @@ def main() -> None:
     lines: list[Row] = []
     totals: list[Row] = []
     for task in TASKS:
+        file, more = HERE / f"{task}.csv", HERE / f"undisturbed_{task}.csv"
         if len(sys.argv) > 1:
-            gather(Path(sys.argv[1]), task)
-        file = HERE / f"{task}.csv"
+            gather(Path(sys.argv[1]), task, ("bias", "noise"), file)
+            gather(Path(sys.argv[1]), task, ("undisturbed",), more)
         if not file.exists():
             continue
         episodes = read(file)
@@ -164,9 +166,14 @@ def main() -> None:
         policies = str(len({row["run"] for row in episodes}))
         totals.append({"task": task, "policies": policies, **overall(episodes)})
         for noise in dict.fromkeys(row["noise"] for row in episodes):
-            line = {"task": task, "policies": policies, "noise": noise}
+            of = read(more) if more.exists() else episodes
+            count = sum(
+                (row["l1"], row["noise"]) == ("off", noise) and row["bias"] == 0 == row["signs"]
+                for row in of
+            )
+            line = {"task": task, "policies": policies, "noise": noise, "episodes": str(count)}
             for l1 in ("paper", "robust"):
-                found = harm(episodes, noise, l1)
+                found = harm(of, noise, l1)
                 line[f"L1 {l1}, %"] = f"{found['mean']} {found['interval']}"
             lines.append(line)
         for row in biased:
