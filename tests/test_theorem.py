@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
+import importlib
 import math
-import sys
 from pathlib import Path
 
 import pytest
@@ -20,10 +19,9 @@ def read(file: Path) -> list[dict[str, str]]:
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    spec = importlib.util.spec_from_file_location("theorem1", ROOT / "docs/results/theorem1.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["theorem1"] = module
-    spec.loader.exec_module(module)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "docs/results"))  # as when it is run from there
+        module = importlib.import_module("theorem1")
     folder = tmp_path_factory.mktemp("theorem1")
     module.main(folder, quick=True)
     return folder

@@ -19,7 +19,6 @@ from torchrl.envs import (
     DoubleToFloat,
     EnvBase,
     GymEnv,
-    ObservationNorm,
     ParallelEnv,
     SerialEnv,
     StepCounter,
@@ -152,21 +151,6 @@ def test_refused_in_a_replay_buffer():
     buffer.append_transform(L1Transform(make_model(), dt=0.05))
     with pytest.raises(RuntimeError, match="append it to a TransformedEnv, not to a replay"):
         buffer.sample()
-
-
-def test_a_later_transform_of_the_observation_is_refused():
-    def normalise(**keys) -> ObservationNorm:
-        return ObservationNorm(0.0, 1.0, in_keys=["observation"], **keys)
-
-    l1 = L1Transform(make_model(), dt=0.05)
-    with pytest.raises(ValueError, match="ObservationNorm comes after L1Transform"):
-        make_env(l1, normalise()).reset()
-    nested = TransformedEnv(GymEnv("Pendulum-v1"), L1Transform(make_model(), dt=0.05))
-    nested.append_transform(Compose(normalise()))
-    with pytest.raises(ValueError, match="ObservationNorm comes after L1Transform"):
-        nested.reset()
-    make_env(normalise(), L1Transform(make_model(), dt=0.05)).rollout(2)
-    make_env(L1Transform(make_model(), dt=0.05), normalise(out_keys=["normalised"])).rollout(2)
 
 
 def test_widths_and_keys_that_do_not_fit_are_named():

@@ -1,0 +1,346 @@
+"""L1 in pipelines of others: the situations in which an error says what is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.envs import (
+    CatFrames,
+    Compose,
+    DTypeCastTransform,
+    ExcludeTransform,
+    FrameSkipTransform,
+    RenameTransform,
+    SelectTransform,
+    Transform,
+    TransformedEnv,
+    VecNormV2,
+)
+
+from tests.control.compositions import BOTH, Identity, Pipeline, model, normaliser, pendulum, two
+from torchrl_l1.control import L1Controller, L1Transform, init
+from torchrl_l1.envs import (
+    ActionNoise,
+    ActuatorBias,
+    ActuatorGain,
+    ObservationNoise,
+    SensorBias,
+    Stiction,
+)
+
+
+class Overwrites(Transform):
+    """A transform of a user's, which declares nothing."""
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        observation = (next_tensordict["observation"] - 5.0) / 0.1
+        return next_tensordict.set("observation", observation)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+
+class OverwritesAfterSteps(Overwrites):
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return tensordict_reset
+
+
+class WritesInPlace(nn.Module):
+    def forward(self, observation: Tensor) -> Tensor:
+        return observation.mul_(0.999)
+
+
+class Repeats(Transform):
+    """A frame skip of a user's."""
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self.parent._step(tensordict)
+
+
+class Compensated(Transform):
+    """A disturbance of a user's, which the oracle would know."""
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.set("action", tensordict["action"] + 0.3)
+
+    def compensate(self, action: Tensor) -> Tensor:
+        return action - 0.3
+
+
+def dropping(*keys: Any) -> TensorDictModule:
+    """A module of a policy after which keys are gone, as of one that copies what it knows."""
+    return Dropping(keys)
+
+
+class Dropping(TensorDictModuleBase):
+    in_keys = ["observation"]
+    out_keys = ["observation"]
+
+    def __init__(self, keys: Sequence[Any]) -> None:
+        super().__init__()
+        self.keys = keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        for key in self.keys:
+            tensordict.pop(key, None)
+        return tensordict
+
+
+class Zeroing(Dropping):
+    """Fills the state with zeros, as buffers do that know only its specs."""
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        for key in self.keys:
+            tensordict.set(key, torch.zeros_like(tensordict.get(key)))
+        return tensordict
+
+
+IS_NOT = r"'observation' is not what the environment gave: .* separate out_keys, .*observation_key"
+OVERWRITES = r"comes after L1Transform and overwrites 'observation'.*separate out_keys"
+DISTURBS = r"comes after L1Transform, so that it disturbs.*write Compose\(\.\.\., {}\(\.\.\.\), L1T"
+LOST = r"\[{}\] under 'l1' are not those that followed from the last step: they were lost"
+
+
+WRONG: dict[str, tuple[Sequence[str], dict[str, Any], type[Exception], str]] = {
+    "normaliser after": (("transform",), {"after": [normaliser]}, ValueError, OVERWRITES),
+    "normaliser after the primer": (("controller",), {"after": [normaliser]}, ValueError, IS_NOT),
+    "normaliser outside": (BOTH, {"outside": [normaliser]}, ValueError, IS_NOT),
+    "normaliser outside two": (BOTH, {"outside": [normaliser], **two}, ValueError, IS_NOT),
+    "running normaliser outside two": (
+        BOTH,
+        {"outside": [partial(VecNormV2, in_keys=["observation"])], **two},
+        ValueError,
+        IS_NOT,
+    ),
+    "frames stacked after": (
+        ("transform",),
+        {"after": [partial(CatFrames, 2, -1, ["observation"])]},
+        ValueError,
+        OVERWRITES,
+    ),
+    "frames stacked outside two": (
+        BOTH,
+        {"outside": [partial(CatFrames, 2, -1, ["observation"])], **two},
+        ValueError,
+        r"'observation' has shape .*separate out_keys",
+    ),
+    "undeclared after": (BOTH, {"after": [Overwrites]}, ValueError, IS_NOT),
+    "undeclared after, not at reset": (BOTH, {"after": [OverwritesAfterSteps]}, ValueError, IS_NOT),
+    "policy overwrites": (
+        BOTH,
+        {"module": TensorDictModule(Identity(), ["observation"], ["observation"])},
+        ValueError,
+        IS_NOT,
+    ),
+    "policy writes in place": (
+        BOTH,
+        {"module": TensorDictModule(WritesInPlace(), ["observation"], ["other"])},
+        ValueError,
+        IS_NOT,
+    ),
+    "noise on the observation after": (
+        ("transform",),
+        {"after": [partial(ObservationNoise, 0.1)]},
+        ValueError,
+        OVERWRITES,
+    ),
+    "biased sensor after": (
+        ("transform",),
+        {"after": [partial(SensorBias, 0.1)]},
+        ValueError,
+        OVERWRITES,
+    ),
+    "rounded to bfloat16 outside": (
+        BOTH,
+        {
+            "outside": [
+                partial(DTypeCastTransform, torch.float32, torch.bfloat16, ["observation"])
+            ],
+            **two,
+        },
+        ValueError,
+        IS_NOT,
+    ),
+    "frames skipped after": (
+        ("transform",),
+        {"after": [partial(FrameSkipTransform, 3)]},
+        ValueError,
+        r"would apply it again to its own output: write Compose\(\.\.\., FrameSkipTransform\(",
+    ),
+    "frames skipped outside": (
+        ("transform",),
+        {"outside": [partial(FrameSkipTransform, 3)]},
+        ValueError,
+        "stepped 3 times from one state before it came to the next",
+    ),
+    "frames skipped outside two": (
+        ("transform",),
+        {"outside": [partial(FrameSkipTransform, 3)], **two},
+        ValueError,
+        "stepped 3 times from one state before it came to the next",
+    ),
+    "undeclared frame skip after": (
+        ("transform",),
+        {"after": [Repeats]},
+        ValueError,
+        "applied again to its own output",
+    ),
+    **{
+        f"{kind.__name__} after": (
+            ("transform",),
+            {"after": [partial(kind, *arguments)]},
+            ValueError,
+            DISTURBS.format(kind.__name__),
+        )
+        for kind, *arguments in (
+            (ActionNoise, 0.1),
+            (ActuatorBias, 0.5),
+            (ActuatorGain, 0.6),
+            (Stiction, 0.1),
+            (Compensated,),
+        )
+    },
+    "dt of one frame with three": (
+        BOTH,
+        {"before": [partial(FrameSkipTransform, 3)], "dt": 0.05},
+        ValueError,
+        "has dt=0.05, but a step of the environment takes 0.15 s",
+    ),
+    "another dt": (BOTH, {"dt": 0.04}, ValueError, "has dt=0.04, but a step of the env.* 0.05 s"),
+    "another dt, two": (BOTH, {"dt": 0.04, **two}, ValueError, "but a step of the environment tak"),
+    "two of them": (
+        ("transform",),
+        {"before": [partial(L1Transform, model, dt=0.05)]},
+        ValueError,
+        "has entries under 'l1' already",
+    ),
+    "state excluded": (
+        ("transform",),
+        {"after": [partial(ExcludeTransform, "l1")]},
+        ValueError,
+        r"takes away \['x_hat', .*'started', 'seal'\] under 'l1'",
+    ),
+    "part of the state excluded": (
+        ("transform",),
+        {"after": [partial(ExcludeTransform, ("l1", "q"))]},
+        ValueError,
+        r"takes away \['q'\] under 'l1'",
+    ),
+    "part of the state excluded outside": (
+        BOTH,
+        {"outside": [partial(ExcludeTransform, ("l1", "started"))], **two},
+        KeyError,
+        r"found no \['started'\] under 'l1': a transform, a module or a collector took it away",
+    ),
+    "seal excluded outside": (
+        ("transform",),
+        {"outside": [partial(ExcludeTransform, ("l1", "seal"))], **two},
+        KeyError,
+        r"found no \['seal'\] under 'l1'",
+    ),
+    "part of the state renamed": (
+        BOTH,
+        {"after": [partial(RenameTransform, [("l1", "q")], ["other"])]},
+        KeyError,
+        r"found no \['q'\] under 'l1'",
+    ),
+    "state not selected outside": (
+        ("transform",),
+        {"outside": [partial(SelectTransform, "observation")], **two},
+        ValueError,
+        LOST.format(".*'started'"),
+    ),
+    "state not selected in workers": (
+        ("transform",),
+        {"after": [partial(SelectTransform, "observation")], **two},
+        ValueError,
+        "a batched environment would lose",
+    ),
+    "state dropped by the policy": (BOTH, {"module": dropping("l1")}, KeyError, "no state under"),
+    "part of it dropped by the policy": (
+        BOTH,
+        {"module": dropping(("l1", "sigma_m"))},
+        KeyError,
+        r"found no \['sigma_m'\] under 'l1'",
+    ),
+    "start forgotten by the policy": (
+        BOTH,
+        {"module": Zeroing([("l1", "started")])},
+        ValueError,
+        LOST.format("'started'"),
+    ),
+    "filter forgotten by the policy": (
+        BOTH,
+        {"module": Zeroing([("l1", "q"), ("l1", "sigma_m")])},
+        ValueError,
+        LOST.format(".*'sigma_m'"),
+    ),
+    "all forgotten by the policy": (
+        ("transform",),
+        {
+            "module": Zeroing(
+                [("l1", name) for name in ("x_hat", "u_bar", "q", "sigma_m", "started", "seal")]
+            )
+        },
+        ValueError,
+        LOST.format(".*"),
+    ),
+}
+
+
+@pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers:UserWarning")
+@pytest.mark.parametrize(
+    ("name", "face"), [(name, face) for name, (faces, *_) in WRONG.items() for face in faces]
+)
+def test_wrong(name: str, face: str) -> None:
+    _, settings, error, message = WRONG[name]
+    with pytest.raises(error, match=message.replace("L1Transform", "L1(Transform|Controller)")):
+        # At the second step at the latest.
+        pipeline = Pipeline(face, **settings)
+        pipeline.env.rollout(2 if "filter" not in name else 4, pipeline.policy)
+
+
+def test_a_later_transform_of_the_observation_is_refused() -> None:
+    def make(*transforms: Transform) -> TransformedEnv:
+        return TransformedEnv(pendulum(), Compose(*transforms))
+
+    l1 = partial(L1Transform, model, dt=0.05)
+    with pytest.raises(ValueError, match="ObservationNorm comes after L1Transform"):
+        make(l1(), normaliser()).reset()
+    nested = TransformedEnv(pendulum(), l1())
+    nested.append_transform(Compose(normaliser()))
+    with pytest.raises(ValueError, match="ObservationNorm comes after L1Transform"):
+        nested.reset()
+    make(normaliser(), l1()).rollout(2)
+    make(l1(), normaliser(out_keys=["normalised"])).rollout(2)
+
+
+def test_state_that_stays_behind_is_noticed() -> None:
+    pipeline = Pipeline(after=[partial(SelectTransform, "observation")])
+    with pytest.raises(ValueError, match=LOST.format("'x_hat', 'u_bar', 'started'")):
+        pipeline.collect("env.step_mdp")
+
+
+def test_checks_can_be_switched_off() -> None:
+    pipeline = Pipeline(after=[Overwrites], check=False, check_dt=False, dt=0.04)
+    pipeline.collect("rollout")
+
+
+def test_without_a_seal_the_controller_trusts() -> None:
+    controller = L1Controller(model, dt=0.05, action_low=-2.0, action_high=2.0)
+    nested = TensorDict(**init([2], 3, 1).entries(), batch_size=[2])
+    data = TensorDict(
+        observation=torch.ones(2, 3), action=torch.ones(2, 1), l1=nested, batch_size=[2]
+    )
+    assert controller(data)["next", "l1", "started"].all()
