@@ -49,7 +49,7 @@ def draw_errors(runs: Sequence[Row], file: Path) -> None:
             times, error, bound, printed = columns(
                 rows, "sampling_time", "error", "bound", "bound_in_print"
             )
-            draw(times, error, marker="o", markersize=3, label=f"$\\epsilon_a$ = {epsilon:g}")
+            draw(times, error, marker="o", markersize=3, label=f"ε_a = {epsilon:g}")
             draw(times, bound, linestyle="--")
             draw(times, printed, linestyle=":")
         axis.set(xscale="log", yscale="log", title=title, xlabel="sampling time (s)")
@@ -74,9 +74,9 @@ def draw_floors(runs: Sequence[Row], file: Path) -> None:
         epsilon, error = columns([r for r in rows if r["epsilon_a"]], "epsilon_a", "error")
         floors.plot(epsilon, error, marker="o", markersize=4, color=color(index), label=label)
     ends = np.array([min(epsilon), max(epsilon)])
-    floors.plot(ends, 2 * ends, color="black", linestyle="--", label=r"$2\epsilon_a$")
-    floors.plot(ends, ends, color="black", linestyle=":", label=r"$\epsilon_a$")
-    floors.set(xlabel=r"$\epsilon_a$ (1/s)", ylabel=f"largest error at {finest:g} s (1/s)")
+    floors.plot(ends, 2 * ends, color="black", linestyle="--", label="2 ε_a")
+    floors.plot(ends, ends, color="black", linestyle=":", label="ε_a")
+    floors.set(xlabel="ε_a (1/s)", ylabel=f"largest error at {finest:g} s (1/s)")
     floors.legend(frameon=False, fontsize=8)
     for index, noise in enumerate(unique(runs, "noise")[1:]):
         rows = selected(runs, plant="linear", noise=noise)

@@ -147,7 +147,7 @@ def draw(rows: Sequence[Row], sizes: Sequence[Tensor], file: Path) -> None:
         share = 1 - torch.arange(len(size)) / len(size)
         axis.plot(ordered, share, color=color(0), label="residuals")
         axis.axvline(float(row["reach_median"]), color="black", ls="--", lw=1, label="reach")
-        axis.axvline(2 * float(row["epsilon_a"]), color="grey", ls=":", label=r"$2\epsilon_a$")
+        axis.axvline(2 * float(row["epsilon_a"]), color="grey", ls=":", label="2 ε_a")
         axis.set(xscale="log", yscale="log", title=title(str(row["task"])))
         axis.set(xlim=(float(ordered[len(ordered) // 100]), 2 * float(ordered[-1])))
         axis.set(xlabel="norm of the residual (1/s)")

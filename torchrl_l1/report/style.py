@@ -16,14 +16,16 @@ from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogFormatter, NullFormatter
 
 from torchrl_l1.algorithms.collection import ORACLE
 from torchrl_l1.atomic import write_through
 from torchrl_l1.report.identity import BASELINE
 
-# Labels hold values from files: what stands between dollars is no formula.
-matplotlib.rcParams["text.parse_math"] = False
+# Labels hold values from files: what stands between dollars is no formula. Not for all figures of
+# the process, others of which are the user's.
+_PLAIN = {"text.parse_math": False}
 
 _DPI = 130
 
@@ -125,7 +127,8 @@ def grid(panels: int, columns: int, width: float, height: float) -> tuple[Figure
     # A single panel still has to carry a legend of some width.
     figure = Figure(figsize=(max(width * columns, 6.4), height * rows), dpi=_DPI)
     FigureCanvasAgg(figure)
-    axes = figure.subplots(rows, columns, squeeze=False)
+    with matplotlib.rc_context(_PLAIN):
+        axes = figure.subplots(rows, columns, squeeze=False)
     flat = list(axes.flat)
     for empty in flat[panels:]:
         empty.set_visible(False)
@@ -189,9 +192,12 @@ def save(figure: Figure, file: Path) -> Path:
                 axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
                 low, high = axis.get_view_interval()
                 axis.set_minor_formatter(LogFormatter() if high < 10 * low else NullFormatter())
-    # As a layout of the figure's own it would be followed by a drawing that nobody sees.
-    ConstrainedLayoutEngine().execute(figure)
-    write_through(file, lambda buffer: figure.savefig(buffer, format=file.suffix[1:] or "png"))
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
+    with matplotlib.rc_context(_PLAIN):
+        # As a layout of the figure's own it would be followed by a drawing that nobody sees.
+        ConstrainedLayoutEngine().execute(figure)
+        write_through(file, lambda buffer: figure.savefig(buffer, format=file.suffix[1:] or "png"))
     # Nobody needs its pixels any more; circles of what was drawn before would stay for long.
     FigureCanvasBase(figure)
     gc.collect(1)
