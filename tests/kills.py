@@ -1,9 +1,10 @@
 """Kills at random moments: whether every run goes on, to the bit, and its loggers hold all of it.
 
-``python -m tests.kills [KILLS] [SEED] [FOLDER] [KIND ...]`` kills METRPO, PETS, MBMF and a campaign
-in turn, each once at a moment that is drawn, and starts it again. In every second round W&B's own
-process is killed as well, as by a power cut. It prints a table, and ends with status 1 if anything
-is lost. Processes are forked from one that has loaded the package, where that can be done.
+``python -m tests.kills [KILLS] [SEED] [FOLDER] [KIND ...]`` kills METRPO, PETS, MBMF, offline
+learning and a campaign in turn, each once at a moment that is drawn, and starts it again. In every
+second round W&B's own process is killed as well, as by a power cut. It prints a table, and ends
+with status 1 if anything is lost. Processes are forked from one that has loaded the package, where
+that can be done.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import yaml
 
 from tests.conftest import HAS_FORKS, PRELOADED, Forked, Process, started_anew
@@ -43,6 +45,12 @@ MBMF = [
     *("evaluation_episodes=2", "shooting.candidates=16", "shooting.horizon=4", "model.hidden=[8]"),
     *("fit.max_epochs=20", "cloning.max_epochs=20", "fine_tuning.epochs=20"),
 ]
+OFFLINE = [
+    *("outer_iterations=6", "horizon=15", "trpo_iterations=20", "evaluation_episodes=2"),
+    *("imagined_steps=100", "imagined_horizon=10", "model.members=2", "model.hidden=[8]"),
+    *("policy.hidden=[8]", "fit.batch_size=16", "fit.max_epochs=50", "cloning.max_epochs=20"),
+    "trpo.fisher_fraction=1.0",
+]
 CAMPAIGN = {
     "runs": [
         {
@@ -57,6 +65,7 @@ RUNS = {
     "metrpo": ("metrpo/inverted_pendulum", METRPO),
     "pets": ("pets/inverted_pendulum", PETS),
     "mbmf": ("mbmf/inverted_pendulum", MBMF),
+    "offline": ("offline/inverted_pendulum", OFFLINE),
 }
 KINDS = (*RUNS, "campaign")
 PATIENCE = 600.0
@@ -69,7 +78,26 @@ def command(kind: str, folder: Path) -> list[str]:
         file.write_text(yaml.safe_dump(CAMPAIGN))
         return ["campaign", str(file), "--output", str(folder), "--workers", "2"]
     recipe, settings = RUNS[kind]
+    if kind == "offline":
+        file = folder.parent / "dataset.npz"
+        if not file.exists():
+            write_dataset(file)
+        settings = [*settings, f"dataset={file}"]
     return ["run", recipe, *settings, "wandb.mode=offline", f"run_dir={folder}", "--resume"]
+
+
+def write_dataset(file: Path) -> None:
+    """Four episodes of a pendulum that does what it likes."""
+    rng = np.random.default_rng(0)
+    observation = rng.normal(scale=0.1, size=(80, 4)).cumsum(0)
+    truncated = np.arange(80) % 20 == 19
+    np.savez(
+        file,
+        observation=observation,
+        action=rng.uniform(-3, 3, (80, 1)),
+        reward=-(observation[:, 0] ** 2),
+        truncated=truncated,
+    )
 
 
 def start(kind: str, folder: Path) -> Process:
