@@ -25,7 +25,7 @@ from torchrl_l1.report.identity import BASELINE
 
 # Labels hold values from files: what stands between dollars is no formula. Not for all figures of
 # the process, others of which are the user's.
-_PLAIN = {"text.parse_math": False}
+_PLAIN: Any = {"text.parse_math": False}
 
 _DPI = 130
 
