@@ -84,7 +84,7 @@ def test_report_joins_tables_and_figures(campaign: Path, tmp_path: Path) -> None
         assert f"\n## {heading}\n" in text
     assert "10 runs, of which 9 are finished" in text
     assert "seed 3: 2 of 5 iterations" in text
-    assert "9 of 15 runs finished, 1 unfinished, 5 not begun" in text
+    assert "9 of 21 runs finished, 1 unfinished, 11 not begun" in text
     assert f"$ torchrl-l1 campaign figure2 --output {campaign}\n" in text
     assert f"--reference-curves {curves}\n" in text
     assert "| torch | 2.13.0 | 10 |" in text
