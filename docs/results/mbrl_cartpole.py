@@ -25,7 +25,7 @@ import gymnasium
 
 HERE = Path(__file__).with_suffix("")
 SEEDS = (0, 1, 2)
-STEPS, LONGEST = 500, 200
+STEPS, LONGEST = 200, 200
 LIMITS = {0: 2.4, 2: 0.2094395102393195}  # of the cart, m, and of the pole, rad
 COLOURS = {"mbrl-lib": "#999999", "ours": "#0072b2"}
 Row = dict[str, Any]
@@ -141,7 +141,7 @@ def ours(seed: int, folder: Path) -> list[Row]:
         str(Path(sys.executable).with_name("torchrl-l1")),
         *("run", "pets/any", "l1=off", "threads=1", "wandb.mode=disabled", f"seed={seed}"),
         *(f"task={here}:make_env", f"reward={here}:reward", f"termination={here}:fallen"),
-        *("dt=0.02", f"horizon={LONGEST}", "outer_iterations=4", f"run_dir={folder}"),
+        *("dt=0.02", f"horizon={LONGEST}", "outer_iterations=2", f"run_dir={folder}"),
     ]
     subprocess.run(command, check=True)
     return [
