@@ -23,10 +23,6 @@ from torchrl_l1.algorithms.collection import ORACLE
 from torchrl_l1.atomic import write_through
 from torchrl_l1.report.identity import BASELINE
 
-# Labels hold values from files: what stands between dollars is no formula. Not for all figures of
-# the process, others of which are the user's.
-_PLAIN: Any = {"text.parse_math": False}
-
 _DPI = 130
 
 # Okabe and Ito: told apart with any colour vision. Grey is kept for the authors' curves.
@@ -127,8 +123,7 @@ def grid(panels: int, columns: int, width: float, height: float) -> tuple[Figure
     # A single panel still has to carry a legend of some width.
     figure = Figure(figsize=(max(width * columns, 6.4), height * rows), dpi=_DPI)
     FigureCanvasAgg(figure)
-    with matplotlib.rc_context(_PLAIN):
-        axes = figure.subplots(rows, columns, squeeze=False)
+    axes = figure.subplots(rows, columns, squeeze=False)
     flat = list(axes.flat)
     for empty in flat[panels:]:
         empty.set_visible(False)
@@ -192,9 +187,13 @@ def save(figure: Figure, file: Path) -> Path:
                 axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
                 low, high = axis.get_view_interval()
                 axis.set_minor_formatter(LogFormatter() if high < 10 * low else NullFormatter())
+    # Labels hold values from files: what stands between dollars is no formula. Other figures of the
+    # process are the user's.
     for text in figure.findobj(Text):
         text.set_parse_math(False)
-    with matplotlib.rc_context(_PLAIN):
+    with matplotlib.rc_context(
+        {"text.parse_math": False}
+    ):  # for the labels of ticks yet to be made
         # As a layout of the figure's own it would be followed by a drawing that nobody sees.
         ConstrainedLayoutEngine().execute(figure)
         write_through(file, lambda buffer: figure.savefig(buffer, format=file.suffix[1:] or "png"))
