@@ -2,8 +2,8 @@
 
     python docs/results/questions.py
 
-Reads `baselines/`, `table1_first/` and `robust/` beside this file, which the commands of their
-pages write, and the paper's table. Writes `questions/table1.md` and `.png`, and
+Reads `baselines/`, `table1_first/`, `table1/` and `robust/` beside this file, which the commands of
+their pages write, and the paper's table. Writes `questions/table1.md` and `.png`, and
 `questions/recovered.md` and `.png`.
 """
 
@@ -11,16 +11,19 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 import robust
+from matplotlib.axes import Axes
 
 from torchrl_l1.report.page import markdown
 from torchrl_l1.report.published import published_cells
 
 HERE = Path(__file__).with_name("questions")
-RUNS = Path(__file__).with_name("table1_first")
+# Reports of runs, the earliest first.
+EDITIONS = ("baselines", "table1_first", "table1")
 NOISES = ("none", "action", "observation")
 # Differences are drawn as shares of these returns: of the pendulum that of a pole that hangs.
 SCALES = {
@@ -30,62 +33,116 @@ SCALES = {
     "walker": 800.0,
     "half_cheetah": 3270.0,
 }
-Key = tuple[str, str]
+# Controllers in training: colour, and place beside the line of a cell.
+ARMS = {"paper": ("tab:orange", 0.16), "robust": ("tab:blue", -0.16)}
+Row = dict[str, str]
 
 
-def ours() -> tuple[dict[tuple[str, str, str], str], dict[Key, dict[str, str]]]:
-    """Mean returns by task, noise and controller, and the paired differences."""
-    returns = {}
-    for folder in (RUNS.with_name("baselines"), RUNS):
-        with (folder / "training.csv").open(newline="") as handle:
-            for row in csv.DictReader(handle):
-                returns[row["task"], row["noise"], row["l1"]] = row["return_mean"]
-    with (RUNS / "pairs.csv").open(newline="") as handle:
-        pairs = {
-            (row["task"], row["noise"]): row
-            for row in csv.DictReader(handle)
-            if row["policy"] == "stochastic"
-        }
-    return returns, pairs
+class Cell(NamedTuple):
+    """What runs have returned in a cell of the table.
+
+    Attributes:
+        edition: the folder that they are from.
+        returns: mean return by controller in training.
+        pairs: paired differences from training without L1, by controller.
+    """
+
+    edition: str
+    returns: Row
+    pairs: dict[str, Row]
+
+
+def rows(folder: str, name: str) -> list[Row]:
+    """Those of a report's file; none where it has not been written."""
+    file = Path(__file__).with_name(folder) / name
+    if not file.exists():
+        return []
+    with file.open(newline="") as handle:
+        return list(csv.DictReader(handle))
+
+
+def ours() -> dict[tuple[str, str], Cell]:
+    """By task and noise; of two editions of a cell the one with more pairs, or the later one."""
+    cells: dict[tuple[str, str], Cell] = {}
+    for edition in EDITIONS:
+        found: dict[tuple[str, str], Cell] = {}
+        for row in rows(edition, "training.csv"):
+            cell = found.setdefault((row["task"], row["noise"]), Cell(edition, {}, {}))
+            cell.returns[row["l1"]] = row["return_mean"]
+        for row in rows(edition, "pairs.csv"):
+            if row["policy"] == "stochastic":
+                found[row["task"], row["noise"]].pairs[row["l1"]] = row
+        for key, cell in found.items():
+            if key not in cells or seeds(cell) >= seeds(cells[key]):
+                cells[key] = cell
+    return cells
+
+
+def seeds(cell: Cell) -> int:
+    """Pairs of the controller that has most."""
+    return max((int(pair["pairs"]) for pair in cell.pairs.values()), default=0)
+
+
+def draw(ax: Axes, pair: Row, row: float, scale: float, color: str) -> None:
+    """A controller's differences in a cell: each seed, mean and interval."""
+    differences = np.array(pair["differences"].split(), dtype=np.float64) / scale
+    ax.plot(differences, np.full_like(differences, row), "|", color=color, markersize=7)
+    ax.plot(float(pair["difference_mean"]) / scale, row, "D", color=color, markersize=4)
+    if pair["difference_low"]:
+        ends = np.array([float(pair[f"difference_{end}"]) for end in ("low", "high")])
+        ax.plot(ends / scale, [row, row], color=color, lw=1)
+
+
+def number(text: str) -> str:
+    """Three digits, and no exponent for thousands."""
+    value = float(text)
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def line(task: str, noise: str, cell: Cell | None) -> Row:
+    """A cell in the table."""
+    words = {"task": task, "noise": noise, "L1 off": "not run"}
+    for l1 in ARMS:
+        words |= {f"L1 {l1}": "not run", f"{l1} - off": "", f"95 % ({l1})": "", f"pairs ({l1})": ""}
+    if cell is not None:
+        words |= {f"L1 {l1}": f"{float(mean):.4g}" for l1, mean in cell.returns.items()}
+        for l1, pair in cell.pairs.items():
+            words[f"{l1} - off"] = number(pair["difference_mean"])
+            words[f"pairs ({l1})"] = pair["pairs"]
+            if pair["difference_low"]:
+                ends = [number(pair[f"difference_{end}"]) for end in ("low", "high")]
+                words[f"95 % ({l1})"] = f"[{', '.join(ends)}]"
+    off, on = (published_cells()["1", task, noise, l1, l1] for l1 in ("off", "on"))
+    words |= {"published: off": off.mean, "published: L1": on.mean}
+    words["published: difference"] = f"{float(on.mean) - float(off.mean):.4g}"
+    words["runs of"] = cell.edition if cell else ""
+    return words
 
 
 def table1() -> None:
     """All cells of Table 1: ours where there are runs, beside the paper's."""
     HERE.mkdir(exist_ok=True)
-    returns, pairs = ours()
+    found = ours()
     lines = []
-    figure, ax = plt.subplots(figsize=(8, 5), layout="constrained")
+    figure, ax = plt.subplots(figsize=(8, 6), layout="constrained")
     cells = [(task, noise) for task in SCALES for noise in NOISES]
+    labels = []
     for row, (task, noise) in enumerate(reversed(cells)):
-        off, on = (published_cells()["1", task, noise, l1, l1] for l1 in ("off", "on"))
-        theirs = float(on.mean) - float(off.mean)
-        pair = pairs.get((task, noise))
-        ax.plot(theirs / SCALES[task], row, "o", color="0.6", label="paper" if not row else None)
-        line = {"task": task, "noise": noise, "L1 off": "not run", "L1 paper": "not run"}
-        line |= {"difference": "", "95 % interval": "", "seeds": "0"}
-        for l1 in ("off", "paper"):
-            if found := returns.get((task, noise, l1)):
-                line[f"L1 {l1}"] = f"{float(found):.4g}"
-        if pair is not None:
-            line |= {"difference": f"{float(pair['difference_mean']):.3g}", "seeds": pair["pairs"]}
-            seeds = np.array(pair["differences"].split(), dtype=np.float64) / SCALES[task]
-            ax.plot(seeds, np.full_like(seeds, row), "|", color="tab:blue", markersize=9)
-            mean = float(pair["difference_mean"]) / SCALES[task]
-            ax.plot(mean, row, "D", color="tab:blue", markersize=5)
-            if pair["difference_low"]:
-                ends = [float(pair[f"difference_{end}"]) for end in ("low", "high")]
-                line["95 % interval"] = f"[{ends[0]:.3g}, {ends[1]:.3g}]"
-                ax.plot(np.array(ends) / SCALES[task], [row, row], color="tab:blue", lw=1)
-        line |= {"paper off": off.mean, "paper L1": on.mean, "paper difference": f"{theirs:.4g}"}
-        lines.append(line)
+        cell, scale = found.get((task, noise)), SCALES[task]
+        lines.append(line(task, noise, cell))
+        theirs = float(lines[-1]["published: difference"]) / scale
+        ax.plot(theirs, row, "o", color="0.6")
+        for l1, (color, offset) in ARMS.items():
+            if cell is not None and (pair := cell.pairs.get(l1)):
+                draw(ax, pair, row + offset, scale, color)
+        missing = cell is None or not cell.pairs
+        labels.append(f"{task.replace('_', ' ')}, {noise}" + (" (not run)" if missing else ""))
     ax.axvline(0, color="0.8", zorder=0)
-    words = [
-        f"{task.replace('_', ' ')}, {noise}" + ("" if (task, noise) in pairs else " (not run)")
-        for task, noise in reversed(cells)
-    ]
-    ax.set_yticks(range(len(cells)), words)
+    ax.set_yticks(range(len(cells)), labels)
     ax.set_xlabel("return with L1 in training less that without, as a share of the task's scale")
-    ax.plot([], [], "D-", color="tab:blue", markersize=5, label="ours: mean, interval, seeds")
+    ax.plot([], [], "o", color="0.6", label="published")
+    for l1, (color, _) in ARMS.items():
+        ax.plot([], [], "D-", color=color, markersize=4, label=f"ours, {l1}: mean, interval, seeds")
     ax.legend(loc="lower right")
     figure.savefig(HERE / "table1.png", dpi=110)
     plt.close(figure)
