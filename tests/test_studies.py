@@ -160,3 +160,20 @@ def test_index_quotes_the_tables() -> None:
     for task in TASKS:
         for l1 in ("paper", "robust"):
             assert shares[task][f"{l1} recovered"].split()[0] in second, (task, l1)
+
+
+def test_page_on_environments_quotes_its_runs() -> None:
+    text = " ".join(section("docs/environments.md", "## What to expect").split())
+    with (RESULTS / "any_task/reacher.csv").open(newline="") as handle:
+        returns = [f"{float(row['return_mean']):.1f}" for row in csv.DictReader(handle)]
+    assert f"Reacher returns {returns[0]}, {returns[1]} and {returns[2]}" in text
+    learned: dict[str, list[float]] = {}
+    with (RESULTS / "any_task/runs.csv").open(newline="") as handle:
+        for row in csv.DictReader(handle):
+            if row["name"] == "half_cheetah":
+                learned.setdefault(row["seed"], []).append(float(row["return_mean"]))
+    last = [f"{sum(found[-5:]) / 5:.0f}" for found in learned.values()]
+    assert f"it is {last[0]}, {last[1]} and {last[2]}" in text
+    precision = rows((RESULTS / "precision/table.md").read_text())
+    ours = [row["float32"] for row in precision if row["recipe"] == "metrpo half_cheetah"]
+    assert f"[at {ours[0]}, {ours[1]} and {ours[2]}]" in text
