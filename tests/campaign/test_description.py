@@ -285,6 +285,7 @@ def test_shipped_campaigns_are_the_papers(capsys: pytest.CaptureFixture[str]) ->
     assert sizes["table1_first"] == 3 * 2 * 5 + 2 * 4 + 2 * 2
     assert sizes["figure2"] == 3 * 3 + 3 * 4
     assert sizes["pets"] == 2 * 2 * 2 * 5
+    assert sizes["pets_long"] == 2 * 2 * 3
     assert sizes["mbmf"] == 3 * 2 * 5 + 2 * 2 * 2
     assert sizes["mbmf_rest"] == 2 * 2 * 2 * 2 + 2 * 3 * 2 * 2
     main(["recipes"])
