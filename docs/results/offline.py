@@ -4,8 +4,8 @@
     torchrl-l1 campaign offline --output runs/offline
     python docs/results/offline.py runs/offline
 
-Writes `summary.csv`, `returns.md`, `recovered.md` and `returns.png` to the folder
-`offline` beside this file.
+Writes `summary.csv`, `returns.md`, `recovered.md`, `imagination.md` and `returns.png` to the
+folder `offline` beside this file.
 """
 
 from __future__ import annotations
@@ -183,6 +183,29 @@ def recovered_page(summary: Sequence[Row]) -> str:
     return markdown(lines)
 
 
+def imagination_page(rows: Sequence[Row], horizon: dict[str, int]) -> str:
+    """What imagination makes of the cloned policies, without bias and L1, seed by seed."""
+    lines = []
+    for task in TASKS:
+        for quality in QUALITIES:
+            cell = select(rows, task=task, quality=quality, l1="off", bias=0.0)
+            if not cell:
+                continue
+            seeds = sorted({row["seed"] for row in cell})
+            of_seed = [select(cell, seed=seed) for seed in seeds]
+            after = [float(np.mean([row["return"] for row in found])) for found in of_seed]
+            lines.append(
+                {
+                    "task": task,
+                    "data": quality,
+                    "return of the data": number(cell[0]["data_reward"] * horizon[task]),
+                    "cloned policies": ", ".join(number(found[0]["clone"]) for found in of_seed),
+                    "after imagination": ", ".join(map(number, after)),
+                }
+            )
+    return markdown(lines)
+
+
 def draw(summary: Sequence[Row]) -> None:
     """Returns against the bias, a panel for each task and quality."""
     tasks = [task for task in TASKS if select(summary, task=task)]
@@ -233,6 +256,7 @@ def main(folder: Path) -> None:
     horizon = {task: get_task(task).horizon for task in TASKS}
     (HERE / "returns.md").write_text(returns_page(summary, rows, horizon) + "\n")
     (HERE / "recovered.md").write_text(recovered_page(summary) + "\n")
+    (HERE / "imagination.md").write_text(imagination_page(rows, horizon) + "\n")
     draw(summary)
     print((HERE / "returns.md").read_text(), (HERE / "recovered.md").read_text(), sep="\n")
 
