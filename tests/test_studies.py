@@ -177,3 +177,15 @@ def test_page_on_environments_quotes_its_runs() -> None:
     precision = rows((RESULTS / "precision/table.md").read_text())
     ours = [row["float32"] for row in precision if row["recipe"] == "metrpo half_cheetah"]
     assert f"[at {ours[0]}, {ours[1]} and {ours[2]}]" in text
+
+
+def test_page_on_offline_learning_quotes_what_is_recovered() -> None:
+    text = " ".join(section("docs/studies/offline.md", "**In short.**").split()).partition("## ")[0]
+    found = {
+        (row["task"], row["data"]): (row["robust recovers"], row["paper recovers"])
+        for row in rows((RESULTS / "offline/recovered.md").read_text())
+        if row["bias"] == "all others"
+    }
+    assert len(found) == 9
+    for shares in found.values():
+        assert all(share in text for share in shares), shares
