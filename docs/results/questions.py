@@ -34,22 +34,29 @@ SCALES = {
     "half_cheetah": 3270.0,
 }
 # Controllers in training: colour, and place beside the line of a cell.
-ARMS = {"paper": ("tab:orange", 0.16), "robust": ("tab:blue", -0.16)}
+ARMS = {"paper": ("tab:orange", -0.16), "robust": ("tab:blue", 0.16)}
 Row = dict[str, str]
 
 
-class Cell(NamedTuple):
-    """What runs have returned in a cell of the table.
+class Found(NamedTuple):
+    """What an edition's runs have returned in a cell of the table, with a controller and without.
 
     Attributes:
         edition: the folder that they are from.
-        returns: mean return by controller in training.
-        pairs: paired differences from training without L1, by controller.
+        off: mean return without L1; empty if there are no runs.
+        on: mean return with the controller in training, likewise.
+        pair: paired differences between the two, if there are any.
     """
 
     edition: str
-    returns: Row
-    pairs: dict[str, Row]
+    off: str
+    on: str
+    pair: Row | None
+
+    @property
+    def pairs(self) -> int:
+        """How many seeds have been trained both ways."""
+        return int(self.pair["pairs"]) if self.pair else 0
 
 
 def rows(folder: str, name: str) -> list[Row]:
@@ -61,26 +68,27 @@ def rows(folder: str, name: str) -> list[Row]:
         return list(csv.DictReader(handle))
 
 
-def ours() -> dict[tuple[str, str], Cell]:
-    """By task and noise; of two editions of a cell the one with more pairs, or the later one."""
-    cells: dict[tuple[str, str], Cell] = {}
+def ours(task: str, noise: str, l1: str) -> Found | None:
+    """Of the editions that have the cell the one with most pairs, or the latest of these."""
+    best = None
     for edition in EDITIONS:
-        found: dict[tuple[str, str], Cell] = {}
-        for row in rows(edition, "training.csv"):
-            cell = found.setdefault((row["task"], row["noise"]), Cell(edition, {}, {}))
-            cell.returns[row["l1"]] = row["return_mean"]
-        for row in rows(edition, "pairs.csv"):
-            if row["policy"] == "stochastic":
-                found[row["task"], row["noise"]].pairs[row["l1"]] = row
-        for key, cell in found.items():
-            if key not in cells or seeds(cell) >= seeds(cells[key]):
-                cells[key] = cell
-    return cells
-
-
-def seeds(cell: Cell) -> int:
-    """Pairs of the controller that has most."""
-    return max((int(pair["pairs"]) for pair in cell.pairs.values()), default=0)
+        returns = {
+            row["l1"]: row["return_mean"]
+            for row in rows(edition, "training.csv")
+            if (row["task"], row["noise"]) == (task, noise)
+        }
+        pair = [
+            row
+            for row in rows(edition, "pairs.csv")
+            if (row["task"], row["noise"], row["l1"]) == (task, noise, l1)
+            and row["policy"] == "stochastic"
+            and int(row["pairs"])
+        ]
+        on = returns.get(l1, "")
+        found = Found(edition, returns.get("off", ""), on, pair[0] if pair else None)
+        if found.off and (best is None or found.pairs >= best.pairs):
+            best = found
+    return best
 
 
 def draw(ax: Axes, pair: Row, row: float, scale: float, color: str) -> None:
@@ -99,45 +107,47 @@ def number(text: str) -> str:
     return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
-def line(task: str, noise: str, cell: Cell | None) -> Row:
+def line(task: str, noise: str, l1: str, found: Found | None) -> Row:
     """A cell in the table."""
-    words = {"task": task, "noise": noise, "L1 off": "not run"}
-    for l1 in ARMS:
-        words |= {f"L1 {l1}": "not run", f"{l1} - off": "", f"95 % ({l1})": "", f"pairs ({l1})": ""}
-    if cell is not None:
-        words |= {f"L1 {l1}": f"{float(mean):.4g}" for l1, mean in cell.returns.items()}
-        for l1, pair in cell.pairs.items():
-            words[f"{l1} - off"] = number(pair["difference_mean"])
-            words[f"pairs ({l1})"] = pair["pairs"]
-            if pair["difference_low"]:
-                ends = [number(pair[f"difference_{end}"]) for end in ("low", "high")]
-                words[f"95 % ({l1})"] = f"[{', '.join(ends)}]"
-    off, on = (published_cells()["1", task, noise, l1, l1] for l1 in ("off", "on"))
-    words |= {"published: off": off.mean, "published: L1": on.mean}
-    words["published: difference"] = f"{float(on.mean) - float(off.mean):.4g}"
-    words["runs of"] = cell.edition if cell else ""
+    words = {"task": task, "noise": noise, "L1": l1, "off": "not run", "on": "not run"}
+    words |= {"difference": "", "95 % interval": "", "pairs": "0"}
+    if found is not None:
+        words |= {"off": number(found.off), "pairs": str(found.pairs)}
+        if found.on:
+            words["on"] = number(found.on)
+        if found.pair is not None:
+            words["difference"] = number(found.pair["difference_mean"])
+            if found.pair["difference_low"]:
+                ends = [number(found.pair[f"difference_{end}"]) for end in ("low", "high")]
+                words["95 % interval"] = f"[{', '.join(ends)}]"
+    off, on = (published_cells()["1", task, noise, arm, arm] for arm in ("off", "on"))
+    published = l1 == "paper"
+    words |= {"published off": off.mean if published else ""}
+    words |= {"published on": on.mean if published else ""}
+    words["its difference"] = f"{float(on.mean) - float(off.mean):.4g}" if published else ""
+    words["runs of"] = found.edition if found else ""
     return words
 
 
 def table1() -> None:
     """All cells of Table 1: ours where there are runs, beside the paper's."""
     HERE.mkdir(exist_ok=True)
-    found = ours()
-    lines = []
+    lines, labels = [], []
     figure, ax = plt.subplots(figsize=(8, 6), layout="constrained")
     cells = [(task, noise) for task in SCALES for noise in NOISES]
-    labels = []
-    for row, (task, noise) in enumerate(reversed(cells)):
-        cell, scale = found.get((task, noise)), SCALES[task]
-        lines.append(line(task, noise, cell))
-        theirs = float(lines[-1]["published: difference"]) / scale
-        ax.plot(theirs, row, "o", color="0.6")
+    for place, (task, noise) in enumerate(cells):
+        run, scale = False, SCALES[task]
         for l1, (color, offset) in ARMS.items():
-            if cell is not None and (pair := cell.pairs.get(l1)):
-                draw(ax, pair, row + offset, scale, color)
-        missing = cell is None or not cell.pairs
-        labels.append(f"{task.replace('_', ' ')}, {noise}" + (" (not run)" if missing else ""))
+            found = ours(task, noise, l1)
+            lines.append(line(task, noise, l1, found))
+            if theirs := lines[-1]["its difference"]:
+                ax.plot(float(theirs) / scale, place, "o", color="0.6")
+            if found is not None and found.pair is not None:
+                draw(ax, found.pair, place + offset, scale, color)
+                run = True
+        labels.append(f"{task.replace('_', ' ')}, {noise}" + ("" if run else " (not run)"))
     ax.axvline(0, color="0.8", zorder=0)
+    ax.invert_yaxis()
     ax.set_yticks(range(len(cells)), labels)
     ax.set_xlabel("return with L1 in training less that without, as a share of the task's scale")
     ax.plot([], [], "o", color="0.6", label="published")
@@ -146,7 +156,7 @@ def table1() -> None:
     ax.legend(loc="lower right")
     figure.savefig(HERE / "table1.png", dpi=110)
     plt.close(figure)
-    (HERE / "table1.md").write_text(markdown(lines[::-1]) + "\n")
+    (HERE / "table1.md").write_text(markdown(lines) + "\n")
 
 
 def recovered() -> None:
