@@ -96,7 +96,7 @@ def draw(ax: Axes, pair: Row, row: float, scale: float, color: str) -> None:
     differences = np.array(pair["differences"].split(), dtype=np.float64) / scale
     ax.plot(differences, np.full_like(differences, row), "|", color=color, markersize=7)
     ax.plot(float(pair["difference_mean"]) / scale, row, "D", color=color, markersize=4)
-    if pair["difference_low"]:
+    if pair.get("difference_low"):
         ends = np.array([float(pair[f"difference_{end}"]) for end in ("low", "high")])
         ax.plot(ends / scale, [row, row], color=color, lw=1)
 
@@ -117,7 +117,7 @@ def line(task: str, noise: str, l1: str, found: Found | None) -> Row:
             words["on"] = number(found.on)
         if found.pair is not None:
             words["difference"] = number(found.pair["difference_mean"])
-            if found.pair["difference_low"]:
+            if found.pair.get("difference_low"):
                 ends = [number(found.pair[f"difference_{end}"]) for end in ("low", "high")]
                 words["95 % interval"] = f"[{', '.join(ends)}]"
     off, on = (published_cells()["1", task, noise, arm, arm] for arm in ("off", "on"))
