@@ -5,10 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
-from torchrl_l1.report.curves import Panel, main_lines
+from torchrl_l1.report import curves
+from torchrl_l1.report.curves import Line, Panel, main_lines
 from torchrl_l1.report.runs import find_runs
 from torchrl_l1.report.study import Study, studies
+from torchrl_l1.report.style import save
 
 WriteRun = Callable[..., Path]
 
@@ -31,10 +34,44 @@ def test_what_learns_from_data_that_stay_the_same_is_drawn_over_its_iterations(
 def test_beside_others_it_is_drawn_over_real_steps(write_run: WriteRun, tmp_path: Path) -> None:
     for recipe in ("offline/inverted_pendulum", "metrpo/inverted_pendulum"):
         write_run([-3.0, -2.0], "l1=off", recipe=recipe)
-    lines = [
+    lines = lines_of(tmp_path)
+    assert len(lines) == 2 and not Panel("", lines).offline
+
+
+def lines_of(folder: Path) -> list[Line]:
+    """Of all algorithms' runs."""
+    return [
         line
-        for one in studies(find_runs([tmp_path]))
+        for one in studies(find_runs([folder]))
         for _, found in main_lines(one, "inverted_pendulum")
         for line in found
     ]
-    assert len(lines) == 2 and not Panel("", lines).offline
+
+
+@pytest.mark.parametrize(("finished", "scale"), [(False, "linear"), (True, "log")])
+def test_a_run_that_has_just_begun_changes_no_axis(
+    finished: bool,
+    scale: str,
+    write_run: WriteRun,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    write_run([-3.0] * 20, "l1=off")
+    if finished:
+        write_run([-3.0] * 2, "l1=off", recipe="pets/inverted_pendulum")
+    else:
+        write_run([-3.0] * 2, "l1=paper", iterations=20)
+    lines = lines_of(tmp_path)
+    assert len(lines) == 2
+    figures: list[Figure] = []
+
+    def keep(figure: Figure, file: Path) -> Path:
+        figures.append(figure)
+        return save(figure, file)
+
+    monkeypatch.setattr(curves, "save", keep)
+    assert curves.plot_panels([Panel("", lines)], tmp_path / "curves.png")
+    (axis,) = figures[0].axes
+    assert axis.get_xscale() == scale
+    labels = [text.get_text() for minor in (False, True) for text in axis.get_xticklabels(minor)]
+    assert any(labels) and not any("$" in label for label in labels)

@@ -257,6 +257,12 @@ def _draw(axis: Axes, panel: Panel) -> list[np.ndarray]:
         max(panel.along(run)[-1] for run in line.runs if len(run.returns)) for line in panel.lines
     ]
     end = max(ends)
+    # What is still short because it has just begun is no reason for another axis.
+    whole = [
+        own
+        for own, line in zip(ends, panel.lines, strict=True)
+        if any(run.finished for run in line.runs)
+    ]
     for grey in panel.authors:
         steps, values = grey.curves.real_steps.mean(axis=0) / 1000, grey.curves.returns.mean(axis=0)
         _line(axis, steps, values, grey.style, "0.55", 1.8, label=grey.label)
@@ -297,9 +303,8 @@ def _draw(axis: Axes, panel: Panel) -> list[np.ndarray]:
         )
     if panel.stage is not None:
         axis.margins(x=0.03)
-    elif end > _MOST_TIMES * min(ends):
+    elif end > _MOST_TIMES * min(whole, default=end):
         axis.set_xscale("log")
-        axis.xaxis.set_major_formatter("{x:g}")
         axis.set_xlim(right=end * 1.05)
     else:
         axis.set_xlim(0, end * 1.02)

@@ -186,6 +186,7 @@ def save(figure: Figure, file: Path) -> Path:
             # Its own are formulas, which are off.
             if isinstance(axis.get_major_formatter(), LogFormatter):
                 axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            if isinstance(axis.get_minor_formatter(), LogFormatter):
                 low, high = axis.get_view_interval()
                 axis.set_minor_formatter(LogFormatter() if high < 10 * low else NullFormatter())
     # Labels hold values from files: what stands between dollars is no formula. Other figures of the
