@@ -193,3 +193,14 @@ def test_page_on_offline_learning_quotes_what_is_recovered() -> None:
     assert len(found) == 9
     for shares in found.values():
         assert all(share in text for share in shares), shares
+
+
+def test_what_chance_makes_of_a_single_seed_is_quoted() -> None:
+    with (RESULTS / "table1/training.csv").open(newline="") as handle:
+        cells = {(row["task"], row["noise"], row["l1"]): row for row in csv.DictReader(handle)}
+    cell = {l1: cells["swimmer", "observation", l1] for l1 in ("off", "paper", "robust")}
+    returns = [f"{float(row['return_mean']):.3g}" for row in cell.values()]
+    added = f"{float(cell['robust']['u_a']):.6f}"
+    for page in ("index", "table1"):
+        text = (ROOT / f"docs/studies/{page}.md").read_text()
+        assert all(value in text for value in (*returns, added)), page
