@@ -21,7 +21,7 @@ import numpy as np
 
 from torchrl_l1.experiment.files import write_table
 from torchrl_l1.experiment.run_directory import read_config
-from torchrl_l1.report.page import markdown
+from torchrl_l1.report.page import markdown, number
 
 HERE = Path(__file__).parent / "offline"
 TASKS = ("inverted_pendulum", "half_cheetah", "hopper")
@@ -125,11 +125,6 @@ def summarize(rows: Sequence[Row]) -> list[Row]:
                         }
                     )
     return found
-
-
-def number(value: float) -> str:
-    """Three digits, no exponent."""
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
 def interval(row: Row, name: str) -> str:

@@ -10,6 +10,7 @@ their pages write, and the paper's table. Writes `questions/table1.md` and `.png
 from __future__ import annotations
 
 import csv
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ import numpy as np
 import robust
 from matplotlib.axes import Axes
 
-from torchrl_l1.report.page import markdown
+from torchrl_l1.report.page import interval_text, markdown, number
 from torchrl_l1.report.published import published_cells
 
 HERE = Path(__file__).with_name("questions")
@@ -35,6 +36,7 @@ SCALES = {
 }
 # Controllers in training: colour, and place beside the line of a cell.
 ARMS = {"paper": ("tab:orange", -0.16), "robust": ("tab:blue", 0.16)}
+ENDS = ("difference_low", "difference_high")
 Row = dict[str, str]
 
 
@@ -59,6 +61,7 @@ class Found(NamedTuple):
         return int(self.pair["pairs"]) if self.pair else 0
 
 
+@cache
 def rows(folder: str, name: str) -> list[Row]:
     """Those of a report's file; none where it has not been written."""
     file = Path(__file__).with_name(folder) / name
@@ -97,14 +100,8 @@ def draw(ax: Axes, pair: Row, row: float, scale: float, color: str) -> None:
     ax.plot(differences, np.full_like(differences, row), "|", color=color, markersize=7)
     ax.plot(float(pair["difference_mean"]) / scale, row, "D", color=color, markersize=4)
     if pair.get("difference_low"):
-        ends = np.array([float(pair[f"difference_{end}"]) for end in ("low", "high")])
+        ends = np.array([float(pair[name]) for name in ENDS])
         ax.plot(ends / scale, [row, row], color=color, lw=1)
-
-
-def number(text: str) -> str:
-    """Three digits, and no exponent for thousands."""
-    value = float(text)
-    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def line(task: str, noise: str, l1: str, found: Found | None) -> Row:
@@ -112,19 +109,19 @@ def line(task: str, noise: str, l1: str, found: Found | None) -> Row:
     words = {"task": task, "noise": noise, "L1": l1, "off": "not run", "on": "not run"}
     words |= {"difference": "", "95 % interval": "", "pairs": "0"}
     if found is not None:
-        words |= {"off": number(found.off), "pairs": str(found.pairs)}
+        words |= {"off": number(float(found.off)), "pairs": str(found.pairs)}
         if found.on:
-            words["on"] = number(found.on)
+            words["on"] = number(float(found.on))
         if found.pair is not None:
-            words["difference"] = number(found.pair["difference_mean"])
+            words["difference"] = number(float(found.pair["difference_mean"]))
             if found.pair.get("difference_low"):
-                ends = [number(found.pair[f"difference_{end}"]) for end in ("low", "high")]
-                words["95 % interval"] = f"[{', '.join(ends)}]"
+                ends = {name: float(found.pair[name]) for name in ENDS}
+                words["95 % interval"] = interval_text(ends, "difference")
     off, on = (published_cells()["1", task, noise, arm, arm] for arm in ("off", "on"))
-    published = l1 == "paper"
-    words |= {"published off": off.mean if published else ""}
-    words |= {"published on": on.mean if published else ""}
-    words["its difference"] = f"{float(on.mean) - float(off.mean):.4g}" if published else ""
+    words |= dict.fromkeys(("published off", "published on", "its difference"), "")
+    if l1 == "paper":
+        words |= {"published off": off.mean, "published on": on.mean}
+        words["its difference"] = f"{float(on.mean) - float(off.mean):.4g}"
     words["runs of"] = found.edition if found else ""
     return words
 

@@ -193,9 +193,8 @@ def save(figure: Figure, file: Path) -> Path:
     # process are the user's.
     for text in figure.findobj(Text):
         text.set_parse_math(False)
-    with matplotlib.rc_context(
-        {"text.parse_math": False}
-    ):  # for the labels of ticks yet to be made
+    # Labels of ticks are made in drawing.
+    with matplotlib.rc_context({"text.parse_math": False}):
         # As a layout of the figure's own it would be followed by a drawing that nobody sees.
         ConstrainedLayoutEngine().execute(figure)
         write_through(file, lambda buffer: figure.savefig(buffer, format=file.suffix[1:] or "png"))
