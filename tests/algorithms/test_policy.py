@@ -114,11 +114,16 @@ def test_reset_std_touches_nothing_else() -> None:
         policy.reset_std(0.0)
 
 
+@pytest.mark.parametrize("constant", [None, 1e5])
 @pytest.mark.parametrize("hidden", [(), (8,), (16, 8)])
-def test_sampler_draws_what_the_policy_does_and_does_not_follow_it(hidden: tuple[int, ...]) -> None:
+def test_sampler_draws_what_the_policy_does_and_does_not_follow_it(
+    hidden: tuple[int, ...], constant: float | None
+) -> None:
     torch.manual_seed(0)
     policy = GaussianPolicy(4, 2, hidden, std=0.5)
     observation = 3 + 2 * torch.randn(50, 4)
+    if constant is not None:  # whose standard deviation is the floor
+        observation[:, 1] = constant
     policy.normalizer.fit(observation)
     sampler = policy.sampler()
     torch.manual_seed(1)

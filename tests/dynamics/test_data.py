@@ -72,6 +72,20 @@ def test_a_gap_is_told_and_not_bridged(tmp_path: Path) -> None:
     assert len(data) == 5 and (steps < 0.11).all()
 
 
+def test_rows_of_one_time_are_a_gap(tmp_path: Path) -> None:
+    lines = [f"{t},{t},0,1" for t in (0.0, 0.1, 0.2, 0.2, 0.3, 0.4, 0.5)]
+    file = write(tmp_path / "log.csv", "t,angle,rate,torque", *lines)
+    with pytest.warns(UserWarning, match=r"1 steps of time are not 0\.1 s"):
+        data = read_csv(file, **KEYS, time="t")
+    assert len(data) == 5 and data["next", "done"].sum() == 2
+    # A table in which every line stands twice would be left without any transition.
+    file = write(tmp_path / "log.csv", "t,angle,rate,torque", *(2 * lines[:3]), *(2 * lines[4:]))
+    doubled = sorted(file.read_text().splitlines()[1:])
+    file = write(tmp_path / "log.csv", "t,angle,rate,torque", *doubled)
+    with pytest.raises(ValueError, match=r"steps of time from 0 to 0\.1 s: resample"):
+        read_csv(file, **KEYS, time="t")
+
+
 def test_episodes_may_be_interleaved(tmp_path: Path) -> None:
     lines = ["0,0,0,a", "10,0,0,b", "1,0,0,a", "11,0,0,b"]
     file = write(tmp_path / "log.csv", "angle,rate,torque,robot", *lines)
@@ -159,6 +173,8 @@ def test_a_last_observation_without_an_action(tmp_path: Path) -> None:
         ({"x": np.zeros((3, 2, 2)), "u": np.zeros(3)}, ValueError, r"'x' has shape \[3, 2, 2\]"),
         ({"x": np.array(["a", "b"]), "u": np.zeros(2)}, ValueError, "'x' has .* type <U1"),
         ({"x": np.zeros(3), "u": np.zeros(5)}, ValueError, "action has 5 rows, the observation 3"),
+        ({"x": np.zeros((0, 2)), "u": np.zeros((0, 1))}, ValueError, "0 rows, of which none"),
+        ({"x": np.zeros(3), "u": np.zeros(3), "t": np.ones((3, 2))}, ValueError, "'t' has 2 col"),
     ],
 )
 def test_arrays_that_do_not_fit(
@@ -166,7 +182,8 @@ def test_arrays_that_do_not_fit(
 ) -> None:
     np.savez(tmp_path / "log.npz", **arrays)
     with pytest.raises(error, match=message):
-        read_npz(tmp_path / "log.npz", observation="x", action="u")
+        time = "t" if "t" in arrays else None
+        read_npz(tmp_path / "log.npz", observation="x", action="u", time=time)
 
 
 def test_other_files_are_no_archives_of_arrays(tmp_path: Path) -> None:

@@ -227,3 +227,30 @@ def test_hidden_layers_in_bfloat16_stay_close() -> None:
         )
     moved = (paths[0] - start[:, None]).abs().mean()
     assert 0 < (paths[0] - paths[1]).abs().mean() < 0.02 * moved
+
+
+def test_entries_that_never_varied_end_nothing() -> None:
+    torch.manual_seed(0)
+    model, x = EnsembleDynamics(3, 1, members=3, hidden=(16,)), torch.randn(50, 3)
+    x[:, 1] = 5.0
+    change = 0.1 * torch.randn(50, 3)
+    change[:, 1] = 0.0
+    model.fit_statistics(x, torch.randn(50, 1), change)
+    # The model errs there, as every network does, and the box is a single number wide.
+    assert (model.mean_change(x, torch.zeros(50, 1))[:, 1] != 0).all()
+    model.box.low[[0, 2]], model.box.high[[0, 2]] = -1e3, 1e3
+    found = imagine(
+        model, lambda o: torch.randn(50, 1), quadratic, x, 20, LOW, HIGH, lambda o: o[:, 1].float()
+    )
+    assert found["next", "terminated"][:, 0].all()  # a flag of any type is one
+    found = imagine(model, lambda o: torch.randn(50, 1), quadratic, x, 20, LOW, HIGH)
+    assert found["valid"].all() and not found["next", "left_box"].any()
+    assert (found["next", "observation"][..., 1] == 5).all()
+    # Who starts elsewhere is outside from the first step on.
+    found = imagine(model, lambda o: torch.randn(50, 1), quadratic, x + 1, 20, LOW, HIGH)
+    assert found["next", "left_box"][:, 0].all()
+    env = EnsembleModelEnv(model, quadratic, lambda count: x[:count], -1.0, 1.0, (4,))
+    data = env.rollout(20)
+    assert data.shape == (4, 20) and (data["next", "observation"][..., 1] == 5).all()
+    model.change_normalizer.mean[1] = torch.nan
+    assert imagine(model, lambda o: o[:, :1], quadratic, x, 9, LOW, HIGH)["valid"].sum() == 50

@@ -45,6 +45,19 @@ def test_is_the_ensemble_that_it_was_copied_from(form, head, hidden):
                 )
 
 
+@pytest.mark.parametrize("form", ["nonlinear", "affine"])
+def test_an_entry_that_never_varied_costs_no_digits(form):
+    model = fitted(form)
+    x, u = raw_inputs(model)
+    x[:, 1] = 1e5
+    model.fit_statistics(x, u, torch.randn_like(x))
+    network = PlanningNetwork.from_dynamics(model)
+    with torch.no_grad():
+        mean, _ = model.member_distribution(x, u)
+    change = network.change(torch.cat([x, u], -1), 2) * network.change_std + network.change_mean
+    torch.testing.assert_close(change, mean[2], rtol=1e-4, atol=1e-4)
+
+
 def test_does_not_follow_its_model():
     model = fitted()
     network = PlanningNetwork.from_dynamics(model)

@@ -144,6 +144,13 @@ def test_members_that_disagree_on_the_gain_are_no_model_for_l1(share: float) -> 
         assert quality.warning in str(quality)
 
 
+def test_a_single_member_agrees_with_nobody() -> None:
+    model = EnsembleDynamics(2, 1, members=1, hidden=(4,))
+    quality = measure_quality(model, read_transitions(recorded(*[60] * 10)))
+    assert math.isnan(quality.gain_spread) and not quality.warning
+    assert "members" not in str(quality) and "look like an input of" in str(quality)
+
+
 def test_an_error_is_given_as_the_input_that_looks_like_it() -> None:
     data = recorded(*[60] * 10)
     data["next", "observation"] += 0.7 * B.squeeze(-1)

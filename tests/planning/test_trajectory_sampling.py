@@ -65,6 +65,20 @@ def check_moments(returns: torch.Tensor, mean: float, variance: float) -> None:
     assert returns.var().item() == pytest.approx(variance, rel=5 * math.sqrt(2 / len(returns)))
 
 
+@pytest.mark.parametrize("dtype", [torch.bool, torch.int64, torch.float64])
+@pytest.mark.parametrize("discount", [1.0, 0.5])
+def test_rewards_may_be_of_any_type(linear, dtype, discount):
+    returns = evaluate(
+        linear(A, B, C),
+        torch.tensor([START]),
+        torch.zeros(1, 2, 3, 1),
+        lambda x, u, successor: torch.ones(u.shape[:2]).to(dtype),
+        discount=discount,
+    )
+    assert returns.dtype == torch.float32
+    assert returns.tolist() == [[1 + discount + discount**2] * 2]
+
+
 @pytest.mark.parametrize("particles", [1, 2, 3, 5])
 def test_tsinf_has_the_moments_of_the_linear_gaussian_model(linear, particles):
     returns = sampled(linear(A, B, C, STD), "tsinf", particles)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from itertools import pairwise
 from typing import Any
 
@@ -22,6 +23,9 @@ from torchrl_l1.algorithms.facts import KINDS
 from torchrl_l1.dynamics import Normalizer
 from torchrl_l1.envs import AnyTask, action_bounds
 from torchrl_l1.objectives import is_tanh_network
+
+# Standard deviations between an entry's mean and zero up to which statistics fold into weights.
+_MOST_OFFSET = 1e4
 
 _MEAN = (ExplorationType.DETERMINISTIC, ExplorationType.MEAN, ExplorationType.MODE)
 
@@ -84,6 +88,9 @@ class GaussianPolicy(nn.Module):
         """
         if not self.is_plain:
             return torch.no_grad()(self.sample)
+        # An entry that lies far from zero for its spread would lose its digits.
+        if bool((self.normalizer.mean.abs() > _MOST_OFFSET * self.normalizer.std).any()):
+            return torch.no_grad()(deepcopy(self).sample)
         layers = [layer for layer in self.mean if isinstance(layer, nn.Linear)]
         weights = [layer.weight.t().clone() for layer in layers]
         biases = [layer.bias.clone() for layer in layers]

@@ -139,7 +139,8 @@ def read_npz(
                     f"{path}: {name!r} has shape {list(values.shape)} and type {values.dtype}, "
                     "expected numbers of shape [T] or [T, k]"
                 )
-            parts.append(torch.from_numpy(values.astype(np.float64)).reshape(len(values), -1))
+            column = torch.from_numpy(values.astype(np.float64))
+            parts.append(column if column.ndim == 2 else column[:, None])
         lengths = {len(part) for part in parts}
         if len(lengths) != 1:
             raise ValueError(f"{path}: {names} have lengths {sorted(lengths)}, expected one length")
@@ -148,7 +149,10 @@ def read_npz(
     x, u = side_by_side(observation), side_by_side(action)
     if len(x) == len(u) + 1:
         u = torch.cat([u, u.new_zeros(1, u.shape[-1])])
-    clock = None if time is None else side_by_side(time).squeeze(-1)
+    clock = None if time is None else side_by_side(time)
+    if clock is not None and clock.shape[-1] != 1:
+        raise ValueError(f"{path}: {time!r} has {clock.shape[-1]} columns, expected times (T,)")
+    clock = None if clock is None else clock[:, 0]
     labels = None if episode is None else array(episode).reshape(-1)
     for name, values in (("action", u), (time, clock), (episode, labels)):
         if values is not None and len(values) != len(x):
@@ -274,12 +278,14 @@ def _rows(
 def _steps(path: str, clock: Tensor, joined: Tensor) -> tuple[float, Tensor]:
     """The usual step of time, s, and which rows are followed by the next one after that."""
     steps = clock.diff()
-    onward = joined & (steps > 0)
-    if not onward.any():
+    # Rows of one time are a step of no length, and so a gap.
+    onward = joined & (steps >= 0)
+    taken = steps[onward & (steps > 0)]
+    if not len(taken):
         raise ValueError(f"{path}: the time never goes on from one row to the next")
-    dt = float(steps[onward].median())
+    dt = float(taken.median())
     even = (steps - dt).abs() <= _JITTER * dt
-    gaps = int((joined & ~even & ~(steps <= 0)).sum())
+    gaps = int((joined & ~even & ~(steps < 0)).sum())
     if gaps > int(onward.sum()) / 2:
         low, high = float(steps[onward].min()), float(steps[onward].max())
         raise ValueError(

@@ -30,7 +30,8 @@ def imagine(
     """Roll a policy out in the ensemble, one random member per step for the whole batch.
 
     A trajectory that leaves the box around the data ends there: the model knows nothing
-    outside, and rewards imagined there grow without bound. Model and reward see the clipped
+    outside, and rewards imagined there grow without bound. Entries that never varied in the data
+    stay as they are. Model and reward see the clipped
     action; what is stored is the policy's sample, whose likelihood the policy gradient needs.
 
     The model is copied once, with its statistics folded into the weights; rewards and ends are
@@ -67,6 +68,7 @@ def imagine(
     actions = start.new_empty(horizon, batch, m)
     inputs = network.bias.new_empty(batch, n + m)
     box = dynamics.box
+    holds = bool(box.fixed.any())
     observations[0] = observation = start
     for t, member in enumerate(drawn):
         actions[t] = policy(observation)
@@ -76,6 +78,8 @@ def imagine(
         torch.addcmul(
             observation + network.change_mean, change, network.change_std, out=predicted[t]
         )
+        if holds:
+            predicted[t] = box.hold(observation, predicted[t])
         # Clamped for now, so that nothing overflows.
         observation = torch.clamp(predicted[t], box.low, box.high, out=observations[t + 1])
     inside = (predicted == observations[1:]).all(-1)  # NaN is not
@@ -91,10 +95,11 @@ def imagine(
         observations[:-1].flatten(0, 1),
         actions.flatten(0, 1).clamp(action_low, action_high),
         successors,
-    ).unflatten(0, (horizon, batch))
+    ).to(start.dtype)
+    rewards = rewards.unflatten(0, (horizon, batch))
     fallen = torch.zeros_like(inside)
     if terminated is not None:
-        fallen = terminated(successors).unflatten(0, (horizon, batch))
+        fallen = terminated(successors).bool().unflatten(0, (horizon, batch))
     ended = (~inside | fallen).long()
     valid = (ended.cumsum(0) - ended) == 0
     done = valid & ended.bool()
@@ -166,12 +171,12 @@ class EnsembleWorldModel(TensorDictModuleBase):
                 action.reshape(-1, action.shape[-1]),
                 member,
             ).reshape(observation.shape)
-        successor = observation + change
+        successor = self.dynamics.box.hold(observation, observation + change)
         left = ~self.dynamics.box.contains(successor).unsqueeze(-1)
         return tensordict.update(
             {
                 "observation": torch.where(left, observation, successor),
-                "reward": self.reward(observation, action, successor).unsqueeze(-1),
+                "reward": self.reward(observation, action, successor).to(change).unsqueeze(-1),
                 "terminated": left,
                 "done": left,
             }

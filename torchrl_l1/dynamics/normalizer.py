@@ -99,6 +99,19 @@ class DataBox(nn.Module):
         self.low.copy_(low - slack)
         self.high.copy_(high + slack)
 
+    @property
+    def fixed(self) -> Tensor:
+        """Which entries never varied in the data, ``(dim,)`` bool."""
+        return self.low == self.high
+
+    def hold(self, before: Tensor, after: Tensor) -> Tensor:
+        """A prediction ``(..., dim)`` with the entries that never varied as they were before it.
+
+        A model that never saw them change knows nothing of it, and the box has no room for its
+        errors there. What is not finite stays so.
+        """
+        return torch.where(self.fixed & after.isfinite(), before, after)
+
     def contains(self, observation: Tensor) -> Tensor:
         """Whether each observation ``(..., dim)`` lies inside; NaN does not. Shape ``(...,)``."""
         return ((observation >= self.low) & (observation <= self.high)).all(-1)

@@ -40,8 +40,8 @@ class FitQuality:
             the actions that were recorded; NaN where no trajectory kept out of training is so
             long, infinite where the model diverges.
         gain_spread: how much the members of the ensemble disagree on what an action does to the
-            state: root mean square of their deviation from the mean gain, as a share of it. L1
-            acts by this gain.
+            state: root mean square of their deviation from the mean gain, as a share of it; NaN
+            for a single member. L1 acts by this gain.
         input_error: root mean square of the input that would explain what the model misses, per
             entry of the action, in its unit: what L1 sees of the model's errors and of noise.
         training: transitions trained on.
@@ -96,10 +96,9 @@ class FitQuality:
             if all(map(math.isnan, errors))
         ]
         inputs = ", ".join(map(_number, self.input_error))
-        notes.append(
-            f"members differ by {100 * self.gain_spread:.1f} % in what the action does; "
-            f"errors and noise look like an input of {inputs}"
-        )
+        share = f"members differ by {100 * self.gain_spread:.1f} % in what the action does; "
+        agreement = "" if math.isnan(self.gain_spread) else share
+        notes.append(f"{agreement}errors and noise look like an input of {inputs}")
         return "\n".join([head, *table, *notes, *([self.warning] if self.warning else [])])
 
     @property

@@ -159,7 +159,8 @@ def imagined_returns(
         change = predict(inputs[t], t)
         torch.addcmul(states[t], change, network.change_std, out=states[t + 1])
         states[t + 1] += network.change_mean
-    rewards = _along(reward(states[:-1], u, states[1:]), u, "reward")
+    # Rewards may be integers or booleans: discounts and means are not.
+    rewards = _along(reward(states[:-1], u, states[1:]), u, "reward").to(u.dtype)
     if terminated is None:
         # A state that is not finite stays so: the last tells for all.
         sound = torch.isfinite(states[-1]).all(-1)
