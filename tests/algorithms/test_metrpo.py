@@ -172,6 +172,18 @@ def test_fits_and_imagination_have_a_precision_each() -> None:
     assert losses[0] != losses[1] == pytest.approx(losses[0], rel=0.05)
 
 
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"elites": 9}, "fit.elites is 9, but the model has 5 members"),
+        ({"weight_decay": [1.0]}, "fit.weight_decay must hold a coefficient for each"),
+    ],
+)
+def test_a_fit_that_is_not_the_model_s_is_refused_before_work_starts(settings, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        METRPO("inverted_pendulum", METRPOConfig(fit=FitConfig(**settings)))
+
+
 def test_unknown_precisions_are_named() -> None:
     with pytest.raises(ValueError, match=r"^precision must be .* got 'half'"):
         tiny(precision="half")

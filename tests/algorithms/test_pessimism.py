@@ -17,7 +17,7 @@ from torchrl_l1.algorithms.pessimism import (
     halt,
     largest_deviation,
 )
-from torchrl_l1.dynamics import EnsembleDynamics, GaussianHead
+from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, GaussianHead
 
 N, M = 3, 2
 LOW, HIGH = torch.full((M,), -1.0), torch.full((M,), 1.0)
@@ -201,7 +201,8 @@ def test_uncertainty_that_is_no_number_is_unknown() -> None:
     [
         ({"penalty": "mop"}, "penalty must be 'mopo' or 'morel' or 'none', got 'mop'"),
         ({"uncertainty": "deviation"}, "needs members that predict a distribution"),
-        ({"model": ModelConfig(members=1)}, "needs two members or more"),
+        ({"model": ModelConfig(members=1)}, "needs two members or more, model.members is 1"),
+        ({"fit": FitConfig(elites=1)}, "needs two members or more, fit.elites is 1"),
         ({"penalty": "morel", "discount": 1.0}, "needs a discount below 1"),
         ({"penalty_coefficient": -1.0}, "penalty_coefficient must be finite and not negative"),
         ({"halt_deviations": float("nan")}, "halt_deviations must be finite and not negative"),

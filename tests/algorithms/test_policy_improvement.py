@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_l1.algorithms.policy_improvement import imagined_advantages
+from torchrl_l1.algorithms.policy_improvement import _standardize, imagined_advantages
 
 GAMMA, LAMBDA = 0.9, 0.8
 
@@ -49,3 +49,9 @@ def test_advantages_follow_the_definition(box_exit: str) -> None:
     until_fall = loop(rewards[2][:2], values[2][:2], last_value=0.0)
     torch.testing.assert_close(advantage[2, :2, 0], torch.tensor(until_fall))
     torch.testing.assert_close(target, advantage + value)
+
+
+def test_a_single_sample_says_nothing() -> None:
+    # All trajectories may leave the box at once, or there is one of one step.
+    assert _standardize(torch.tensor([[3.0]])).item() == 0
+    torch.testing.assert_close(_standardize(torch.tensor([[1.0], [3.0]])).std(), torch.tensor(1.0))

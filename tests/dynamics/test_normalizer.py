@@ -43,8 +43,11 @@ def test_bad_data_are_named() -> None:
         normalizer.fit(torch.zeros(0, 2))
     with pytest.raises(ValueError, match=r"columns \[1\]"):
         normalizer.fit(torch.tensor([[0.0, float("nan")]]))
-    with pytest.raises(ValueError, match="std_floor"):
-        Normalizer(2, std_floor=0.0)
+    for floor in (0.0, float("nan")):
+        with pytest.raises(ValueError, match="std_floor"):
+            Normalizer(2, std_floor=floor)
+    with pytest.raises(ValueError, match="margin must be finite and not negative, got nan"):
+        DataBox(2, float("nan"))
 
 
 def test_box_widens_the_data_range_and_rejects_nan() -> None:

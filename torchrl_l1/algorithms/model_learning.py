@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, FitReport, fit_ensemble
+from torchrl_l1.dynamics.fit import check_fit
 
 FIT_METRICS: dict[str, str] = {
     "model/train_loss": "Mean training loss of a member in the last epoch, normalised units.",
@@ -66,6 +67,9 @@ class ModelLearning:
             actuators.
         capacity: real transitions that there is room for.
         terminations: whether to keep which transitions terminated an episode.
+
+    Raises:
+        ValueError: if the settings do not fit the model: before any data are collected.
     """
 
     def __init__(
@@ -76,6 +80,7 @@ class ModelLearning:
         capacity: int,
         terminations: bool = False,
     ) -> None:
+        check_fit(config, dynamics)
         self.dynamics, self.config = dynamics, config
         self.action_key = "action" if label == "nominal" else "executed"
         self.optimizer = torch.optim.Adam(

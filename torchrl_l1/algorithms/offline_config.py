@@ -148,11 +148,14 @@ class OfflineConfig:
                 "uncertainty=deviation needs members that predict a distribution: set "
                 "model.head=gaussian, or uncertainty=disagreement"
             )
-        if self.penalty != "none" and self.measure == "disagreement" and self.model.members < 2:
-            raise ValueError(
-                f"penalty={self.penalty} by disagreement needs two members or more, "
-                f"model.members is {self.model.members}"
-            )
+        # Elites alone are asked.
+        counts = {"model.members": self.model.members, "fit.elites": self.fit.elites or 2}
+        for name, count in counts.items():
+            if self.penalty != "none" and self.measure == "disagreement" and count < 2:
+                raise ValueError(
+                    f"penalty={self.penalty} by disagreement needs two members or more, "
+                    f"{name} is {count}"
+                )
         if self.penalty == "morel" and self.bootstrap and self.discount == 1:
             raise ValueError(
                 "penalty=morel with bootstrap=true needs a discount below 1: a trajectory that is "

@@ -20,6 +20,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from torchrl_l1.algorithms.facts import KINDS
+from torchrl_l1.checks import check_positive
 from torchrl_l1.dynamics import Normalizer
 from torchrl_l1.envs import AnyTask, action_bounds
 from torchrl_l1.objectives import is_tanh_network
@@ -60,8 +61,7 @@ class GaussianPolicy(nn.Module):
     @torch.no_grad()
     def reset_std(self, std: float) -> None:
         """Set the standard deviation of every action entry."""
-        if std <= 0:
-            raise ValueError(f"the policy's standard deviation must be positive, got {std}")
+        check_positive("the policy's standard deviation", std)
         self.log_std.fill_(torch.tensor(std).log())
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:

@@ -255,4 +255,6 @@ def imagined_advantages(
 
 
 def _standardize(advantage: Tensor) -> Tensor:
-    return (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+    # A single sample has no standard deviation, and tells of no direction.
+    spread = advantage.std() if advantage.numel() > 1 else 0.0
+    return (advantage - advantage.mean()) / (spread + 1e-8)

@@ -259,7 +259,7 @@ def fit_ensemble(
         ValueError: if there is nothing to train or to validate on, if shapes do not fit or if a
             setting does not fit the model. The model is as it was then.
     """
-    _check(config, dynamics)
+    check_fit(config, dynamics)
     fraction = config.validation_fraction
     like = dynamics.change_normalizer.mean
     keys = (observation_key, action_key)
@@ -359,7 +359,7 @@ def fit_to_transitions(
     on_epoch: Callable[[int], None] | None = None,
 ) -> FitReport:
     """As :func:`fit_ensemble`, to transitions that have been read."""
-    _check(config, dynamics)
+    check_fit(config, dynamics)
     train, validation = two_parts(
         transitions.data,
         transitions.validation,
@@ -471,7 +471,8 @@ def _check_widths(dynamics: EnsembleDynamics, data: TensorDictBase) -> None:
         )
 
 
-def _check(config: FitConfig, dynamics: EnsembleDynamics) -> None:
+def check_fit(config: FitConfig, dynamics: EnsembleDynamics) -> None:
+    """Refuse settings that do not fit the model, with a ``ValueError``."""
     layers, members = len(dynamics.network.weights), dynamics.members
     if config.weight_decay and len(config.weight_decay) != layers:
         raise ValueError(

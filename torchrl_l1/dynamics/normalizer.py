@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from torchrl_l1.checks import check_not_negative, check_positive
+
 
 class Normalizer(nn.Module):
     """Shift and scale that give the data it was fitted to zero mean and unit variance.
@@ -32,8 +34,7 @@ class Normalizer(nn.Module):
 
     def __init__(self, dim: int, std_floor: float = 1e-4) -> None:
         super().__init__()
-        if std_floor <= 0:
-            raise ValueError(f"std_floor must be positive, got {std_floor}")
+        check_positive("std_floor", std_floor)
         self.std_floor = std_floor
         self.register_buffer("mean", torch.zeros(dim))
         self.register_buffer("std", torch.ones(dim))
@@ -84,8 +85,7 @@ class DataBox(nn.Module):
 
     def __init__(self, dim: int, margin: float = 0.5) -> None:
         super().__init__()
-        if margin < 0:
-            raise ValueError(f"margin must not be negative, got {margin}")
+        check_not_negative("margin", margin)
         self.margin = margin
         self.register_buffer("low", torch.full((dim,), -torch.inf))
         self.register_buffer("high", torch.full((dim,), torch.inf))

@@ -255,7 +255,9 @@ def _entry(data: TensorDictBase, key: NestedKey, option: str) -> Tensor:
     value = data.get(key, None)
     if value is None:
         there = ", ".join(sorted(_name(one) for one in data.keys(True, True)))
-        raise KeyError(f"the data have no {_name(key)}, only {there}: name it by {option}")
+        raise KeyError(
+            f"the data have no {_name(key)}, only {there}: name it by {option}, or rename it"
+        )
     if not isinstance(value, Tensor) or value.is_complex():
         kind = value.dtype if isinstance(value, Tensor) else type(value).__name__
         raise ValueError(f"{_name(key)} is {kind}, expected a tensor of real numbers")
