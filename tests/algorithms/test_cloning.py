@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from torchrl_l1.algorithms.cloning import Cloning
 from torchrl_l1.algorithms.mbmf_config import CloningConfig
@@ -80,3 +81,12 @@ def test_state_survives() -> None:
     assert (first.buffer[:] == second.buffer[:]).all()
     second.load_state_dict(make().state_dict())
     assert len(second.buffer) == 0
+
+
+def test_a_range_for_each_action_follows_the_policy_to_its_device() -> None:
+    policy = GaussianPolicy(3, 2, (8,)).to("meta")
+    cloning = Cloning(policy, CloningConfig(), torch.tensor([1.0, 2.0]), capacity=10)
+    data = TensorDict(
+        {"observation": torch.zeros(5, 3), "action": torch.zeros(5, 2)}, batch_size=[5]
+    )
+    assert cloning._loss(data.to("meta")).device.type == "meta"

@@ -221,6 +221,36 @@ def test_functions_of_arrays(env, function, rows, arrays):
     torch.testing.assert_close(found, balance(OBSERVATION))
 
 
+def working_in_place(x):
+    x /= 2.0
+    return x @ (2 * GAIN.T)
+
+
+class OneArray:
+    """A function that writes all its actions to the same memory."""
+
+    def __init__(self):
+        self.action = np.zeros(1, np.float32)
+
+    def __call__(self, x):
+        self.action[:] = GAIN @ x
+        return self.action
+
+
+@pytest.mark.parametrize("function", [working_in_place, OneArray()])
+def test_functions_may_write_to_their_memory(env, function):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        policy = load_policy(function, env)
+    data = TensorDict(observation=OBSERVATION.clone(), batch_size=OBSERVATION.shape[:1])
+    first = policy(data)["action"]
+    assert torch.equal(data["observation"], OBSERVATION)
+    torch.testing.assert_close(first, balance(OBSERVATION))
+    kept = first.clone()
+    actions(policy, -OBSERVATION)
+    assert torch.equal(first, kept)
+
+
 def test_a_batch_that_is_taken_for_one_observation_is_noticed():
     # Two entries and two actions: rows and columns can be confused, and the shape is right.
     box = Bounded(-10.0, 10.0, (2,))

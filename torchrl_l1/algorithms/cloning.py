@@ -142,7 +142,9 @@ class Cloning:
 
     def _loss(self, data: TensorDictBase) -> Tensor:
         mean, _ = self.policy(data["observation"])
-        return ((mean - data["action"]) / self.half_range).square().mean()
+        half = self.half_range
+        half = half.to(mean.device) if isinstance(half, Tensor) else half
+        return ((mean - data["action"]) / half).square().mean()
 
     def state_dict(self) -> dict[str, Any]:
         """The pairs so far, as plain tensors."""

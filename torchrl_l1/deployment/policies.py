@@ -147,10 +147,12 @@ class FunctionPolicy(TensorDictModuleBase):
     def _call(self, observation: Tensor) -> Tensor:
         if isinstance(self.function, nn.Module):
             observation = observation.to(_number_type(self.function) or observation.dtype)
+        # Copies: a function may work on what it is given, and return the same memory each time.
+        observation = observation.clone()
         given: Any = observation.numpy() if self.arrays else observation
         found: Any = self.function(given)
         found = found[0] if isinstance(found, tuple) else found
-        return torch.as_tensor(np.asarray(found) if isinstance(found, list) else found)
+        return torch.as_tensor(np.asarray(found) if isinstance(found, list) else found).clone()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action, within its bounds."""
