@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.data import Bounded, Unbounded
@@ -34,6 +36,7 @@ def actions(policy, observation):
     return policy(data)["action"]
 
 
+BOX = spaces.Box(-1.0, 1.0, (2,))
 OBSERVATION = torch.linspace(-0.1, 0.1, 12).reshape(3, 4)
 
 
@@ -192,6 +195,22 @@ def test_statistics_of_vecnormalize_need_a_word(env, tmp_path):
     expected = torch.as_tensor(model.predict(scaled, deterministic=True)[0])
     torch.testing.assert_close(found, expected)
     assert not torch.allclose(found, raw)
+
+
+@pytest.mark.parametrize(
+    ("observation", "action", "message"),
+    [
+        (spaces.Dict({"goal": BOX}), BOX, r"the policy reads Dict\('goal': Box"),
+        (BOX, spaces.Discrete(2), r"the policy acts in Discrete\(2\): it must"),
+        (spaces.Box(0, 255, (8, 8, 3)), BOX, "Box of one dimension"),
+    ],
+)
+def test_models_of_other_spaces_are_refused(env, observation, action, message):
+    policy = SimpleNamespace(
+        squash_output=False, observation_space=observation, action_space=action
+    )
+    with pytest.raises(ValueError, match=message):
+        load_policy(SimpleNamespace(policy=policy, predict=len), env)
 
 
 def test_normalization_of_another_policy_is_refused(env):

@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
+from gymnasium.spaces import Box
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key_list
@@ -261,6 +262,7 @@ def load_policy(
     predicts = getattr(found, "predict", None)
     if callable(predicts) and hasattr(getattr(found, "policy", None), "squash_output"):
         # A model of Stable-Baselines3, which knows the normaliser that it was trained behind.
+        _check_spaces(found.policy)
         found = StableBaselinesPolicy(
             found.policy, _moments(getattr(found, "get_vec_normalize_env", lambda: None)())
         )
@@ -395,11 +397,22 @@ def _stable_baselines(file: Path, normalization: str | None) -> StableBaselinesP
     with zipfile.ZipFile(file) as archive:
         home = json.loads(archive.read("data"))["policy_class"]["__module__"]
     model = _algorithm(home).load(file, device="cpu")
+    _check_spaces(model.policy)
     stored = None
     if normalization not in (None, NO_NORMALIZATION):
         with open(str(normalization), "rb") as handle:
             stored = pickle.load(handle)
     return StableBaselinesPolicy(model.policy, _moments(stored))
+
+
+def _check_spaces(policy: Any) -> None:
+    """Refuse a policy of Stable-Baselines3 that is none of vectors, before its inside is read."""
+    for what, space in (("reads", policy.observation_space), ("acts in", policy.action_space)):
+        if not isinstance(space, Box) or len(space.shape) != 1:
+            raise ValueError(
+                f"the policy {what} {space}: it must read and give vectors of numbers, each a Box "
+                "of one dimension; wrap what joins or splits them as a function of the observation"
+            )
 
 
 def _moments(normalize: Any) -> tuple[Tensor, Tensor, float, float] | None:
