@@ -114,6 +114,8 @@ def test_empty_cells_and_other_habits(tmp_path: Path) -> None:
             ValueError,
             "line 3, column 'rate': 'off' is no number",
         ),
+        (["angle,rate,torque,rate", "0,0,0,1"], {}, ValueError, "2 columns 'rate': rename them"),
+        (["angle,rate,torque", f"{10**6 * '0'}"], {}, ValueError, "no table of text: field larger"),
         (["angle,rate,torque", "0,0,0"], {}, ValueError, "1 rows, of which none follows"),
         (
             ["angle,rate,torque,t", *(f"0,0,0,{t}" for t in (0, 1, 3, 4, 9, 11, 17))],
@@ -140,6 +142,13 @@ def test_errors_name_file_and_place(
     with pytest.raises(error, match=message) as caught:
         read_csv(file, **KEYS, **options)
     assert "log.csv" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_other_encodings_are_named(tmp_path: Path) -> None:
+    file = tmp_path / "log.csv"
+    file.write_bytes("angle,rate,torque,°C\n0,0,0,20\n".encode("cp1252"))
+    with pytest.raises(ValueError, match=r"log\.csv is no text in UTF-8 .*: save it as such"):
+        read_csv(file, **KEYS)
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:

@@ -95,6 +95,17 @@ def test_model_as_environment() -> None:
     torch.testing.assert_close(rollout["next", "reward"][0, :2, 0], torch.tensor([110.0, 211.0]))
 
 
+def test_specs_are_of_the_model_s_type() -> None:
+    model = drifting_model(2.5).double()
+    env = EnsembleModelEnv(
+        model, lambda x, u, s: s[..., 0] > 1, lambda n: torch.zeros(n, 2), -1.0, 1.0, (4,)
+    )
+    check_env_specs(env)
+    data = env.rollout(3, lambda td: td.set("action", torch.ones(4, 1).double()))
+    assert data["next", "reward"].dtype == data["observation"].dtype == torch.float64
+    assert data["next", "reward"][0, :, 0].tolist() == [0.0, 1.0, 1.0]
+
+
 def test_random_member_propagation_uses_single_members() -> None:
     torch.manual_seed(0)
     model = drifting_model(1e6)

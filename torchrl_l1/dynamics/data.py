@@ -79,7 +79,12 @@ def read_csv(
         raise ValueError("observation and action need the name of a column each")
     numbers = [*observation, *action, *([] if time is None else [time])]
     wanted = [*numbers, *([] if episode is None else [episode])]
-    columns = _columns(path, wanted, numbers, delimiter)
+    try:
+        columns = _columns(path, wanted, numbers, delimiter)
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is no text in UTF-8 ({error.reason}): save it as such") from None
+    except csv.Error as error:
+        raise ValueError(f"{path} is no table of text: {error}") from None
     x, u = (
         torch.tensor([columns[name] for name in names], dtype=torch.float64).T
         for names in (observation, action)
@@ -226,6 +231,8 @@ def _columns(
                 there = ", ".join(header) or "no first line"
                 hint = "" if len(header) > 1 else f", cells taken to be apart by {delimiter!r}"
                 raise KeyError(f"{path} has no column {name!r}, only {there}{hint}")
+            if header.count(name) > 1:
+                raise ValueError(f"{path} has {header.count(name)} columns {name!r}: rename them")
         places = {name: header.index(name) for name in wanted}
         columns: dict[str, list[Any]] = {name: [] for name in wanted}
         for line in lines:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -230,16 +231,18 @@ class EnsembleModelEnv(ModelBasedEnvBase):
         )
         self.start = start
         n, m = dynamics.observation_dim, dynamics.action_dim
+        kind: dict[str, Any] = {"device": device, "dtype": dynamics.change_normalizer.mean.dtype}
         self.observation_spec = Composite(
-            observation=Unbounded((*batch_size, n), device=device), shape=batch_size, device=device
+            observation=Unbounded((*batch_size, n), **kind), shape=batch_size, device=device
         )
         self.state_spec = self.observation_spec.clone()
-        self.action_spec = Bounded(action_low, action_high, (*batch_size, m), device=device)
-        self.reward_spec = Unbounded((*batch_size, 1), device=device)
+        self.action_spec = Bounded(action_low, action_high, (*batch_size, m), **kind)
+        self.reward_spec = Unbounded((*batch_size, 1), **kind)
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: object) -> TensorDict:
         shape = self.batch_size if tensordict is None else tensordict.shape
-        observation = self.start(max(1, shape.numel())).to(self.device)
+        spec = self.observation_spec["observation"]
+        observation = self.start(max(1, shape.numel())).to(self.device, spec.dtype)
         return TensorDict(
             {"observation": observation.reshape(*shape, -1)},
             batch_size=shape,
