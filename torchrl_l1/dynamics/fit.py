@@ -360,11 +360,8 @@ def fit_to_transitions(
 ) -> FitReport:
     """As :func:`fit_ensemble`, to transitions that have been read."""
     check_fit(config, dynamics)
-    train, validation = two_parts(
-        transitions.data,
-        transitions.validation,
-        *("fit", "transitions", "fit.validation_fraction"),
-    )
+    words = ("fit", "transitions", "fit.validation_fraction")
+    train, validation = two_parts(transitions.data, transitions.validation, *words)
     _check_widths(dynamics, train)
     dynamics.train()
     change = train["next", "observation"] - train["observation"]
