@@ -21,6 +21,8 @@ def table(robust) -> Assessment:
 def test_cells():
     assert disturbance_cells("quick") == suite("quick")
     assert disturbance_cells({}) == [{}]
+    for values in (np.linspace(0, 1, 3), torch.tensor([0.5, 1.0]), (0.5, 0.5, 1.0)):
+        assert disturbance_cells({"bias": values}) == [{}, {"bias": 0.5}, {"bias": 1.0}]
     with pytest.raises(ValueError, match="unknown disturbance 'wobble'"):
         disturbance_cells({"wobble": [1.0]})
     with pytest.raises(ValueError, match="unknown suite"):

@@ -35,7 +35,7 @@ _ONLY = "the episodes of one policy"
 
 
 def disturbance_cells(disturbances: Disturbances) -> list[dict[str, float]]:
-    """The cells of a test: undisturbed first, then each value of each disturbance by itself.
+    """The cells of a test: undisturbed first, then each value of each disturbance by itself, once.
 
     Args:
         disturbances: a suite of :func:`~torchrl_l1.envs.suite`, or values by name.
@@ -55,10 +55,11 @@ def disturbance_cells(disturbances: Disturbances) -> list[dict[str, float]]:
             known = ", ".join([*DISTURBANCES, *(f"the suite {one}" for one in SUITES)])
             raise ValueError(f"unknown disturbance {name!r}; there are {known}")
         entry = DISTURBANCES[name]
-        for value in values if isinstance(values, Sequence) else [values]:
-            entry.check(float(value))
-            if value != entry.neutral:
-                cells.append({name: float(value)})
+        for value in np.ravel(np.asarray(values, dtype=float)).tolist():
+            entry.check(value)
+            # Twice the same cell would count its episodes twice.
+            if value != entry.neutral and {name: value} not in cells:
+                cells.append({name: value})
     return cells
 
 
