@@ -378,3 +378,30 @@ def test_accepts_a_snapshot():
     assert torch.equal(
         evaluate(snapshot, x, actions, curved_reward), evaluate(model, x, actions, curved_reward)
     )
+
+
+@pytest.mark.parametrize("propagation", ["ts1", "tsinf", "mean"])
+@pytest.mark.parametrize("common_noise", [False, True])
+def test_models_of_float64_are_planned_with_in_float32(propagation, common_noise):
+    torch.manual_seed(0)
+    model = make_dynamics(2, 1, hidden=(8,), head="gaussian")
+    found = []
+    for kind in (torch.float32, torch.float64):
+        before = torch.get_default_dtype()
+        try:
+            torch.set_default_dtype(kind)
+            found.append(
+                evaluate(
+                    model.to(kind),
+                    torch.tensor([START]),
+                    torch.tensor(ACTIONS)[None, None, :, None],
+                    lambda x, u, successor: successor.sum(-1),
+                    propagation=propagation,
+                    common_noise=common_noise,
+                    generator=torch.Generator().manual_seed(0),
+                )
+            )
+        finally:
+            torch.set_default_dtype(before)
+    assert found[0].dtype == found[1].dtype == torch.float32
+    torch.testing.assert_close(*found)

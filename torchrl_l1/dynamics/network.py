@@ -146,7 +146,7 @@ class PlanningNetwork:
         last = len(weights) - 1
         end = last if dynamics.affine_in_action else last + 1
         low = range(1, end) if last > 1 else range(0)
-        point = isinstance(dynamics.head, DeterministicHead)
+        point, head = isinstance(dynamics.head, DeterministicHead), deepcopy(dynamics.head).float()
         return cls(
             weights=[
                 weight.to(hidden if layer in low else torch.float32)
@@ -158,7 +158,7 @@ class PlanningNetwork:
             change_mean=dynamics.change_normalizer.mean.to(torch.float32, copy=True),
             change_std=dynamics.change_normalizer.std.to(torch.float32, copy=True),
             activation=activation.in_place,
-            standard_deviation=None if point else deepcopy(dynamics.head).standard_deviation,
+            standard_deviation=None if point else head.standard_deviation,
             affine_in_action=dynamics.affine_in_action,
         )
 

@@ -26,7 +26,7 @@ def scenarios(
     members = torch.randint(
         network.members, (horizon, particles), generator=generator, device=device
     )
-    return members, torch.randn(size, generator=generator, device=device)
+    return members, torch.randn(size, generator=generator, device=device, dtype=torch.float32)
 
 
 class Draws:
@@ -80,7 +80,8 @@ class Draws:
             particle = self._particle if order is None else self._particle[order]
             return self._common[1][step].index_select(1, particle).t()
         size = (self._network.observation_dim, self._count)
-        return torch.randn(size, generator=self._generator, device=self.device).t()
+        kind = torch.float32
+        return torch.randn(size, generator=self._generator, device=self.device, dtype=kind).t()
 
 
 Propagation = Literal["ts1", "tsinf", "mean"]

@@ -113,7 +113,7 @@ class ModelPredictiveController(TensorDictModuleBase):
         self.init_key = init_key
         self.key = key
         self.generator = generator
-        zero = torch.zeros(1, config.horizon, sampler.dynamics.action_dim)
+        zero = torch.zeros(1, config.horizon, sampler.dynamics.action_dim, dtype=torch.float32)
         low, high = (
             torch.as_tensor(bound, dtype=zero.dtype) for bound in (action_low, action_high)
         )

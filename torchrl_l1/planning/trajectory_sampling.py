@@ -118,7 +118,7 @@ def evaluate(
     count, horizon = actions.shape[0] * actions.shape[1], actions.shape[2]
     sequences = actions.float().reshape(count, horizon, network.action_dim)
     start = observation.float()
-    total = torch.zeros(count, device=sequences.device)
+    total = sequences.new_zeros(count)
     if block is None:
         block = _CPU_BLOCK if sequences.device.type == "cpu" else _OTHER_BLOCK
     each = member_shares(network, particles, propagation)
