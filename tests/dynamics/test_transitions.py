@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tensordict import TensorDict
+from tensordict import TensorDict, lazy_stack
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.collectors.utils import split_trajectories
@@ -77,6 +77,18 @@ def test_all_that_torchrl_makes_of_the_same_steps_reads_alike() -> None:
             assert torch.equal(read.data[key][order], expected.data[key][other]), name
         # 150 rows end thrice for the batch and twice in each environment for the time limit.
         assert int((~read.joined).sum()) == 9, name
+
+
+def test_a_lazy_stack_of_different_lengths() -> None:
+    one, other = line(4), line(7, offset=100)
+    expected = read_transitions([one, other])
+    for data in (lazy_stack([one, other]), lazy_stack([lazy_stack([one, other])])):
+        assert -1 in data.shape
+        found = read_transitions(data)
+        assert (found.data == expected.data).all()
+        assert torch.equal(found.joined, expected.joined) and found.dropped == 0
+    pairs = lazy_stack([torch.stack([line(4)] * 3), torch.stack([line(7)] * 3)])
+    assert len(read_transitions(pairs).data) == 3 * 4 + 3 * 7
 
 
 def test_trajectories_are_never_torn_where_there_are_enough() -> None:

@@ -69,8 +69,8 @@ def read_transitions(
     trajectories longer than that are cut into pieces first.
 
     Args:
-        data: a tensordict with any batch size, time last (or called ``"time"``), several of them,
-            or a replay buffer.
+        data: a tensordict with any batch size, time last (or called ``"time"``), also a lazy stack
+            of different lengths, several of them, or a replay buffer.
         observation_key: of the observation ``(..., n)``; ``("next", observation_key)`` is the one
             that followed.
         action_key: of the action ``(..., m)``.
@@ -153,7 +153,14 @@ def _parts(data: Data) -> list[TensorDictBase]:
             )
         if not part.ndim:
             raise ValueError("data have batch size []: give transitions with a batch size [N]")
-    return parts
+    return [one for part in parts for one in _even(part)]
+
+
+def _even(data: TensorDictBase) -> list[TensorDictBase]:
+    """The tensordict; trajectories of different lengths, stacked lazily, one by one."""
+    if -1 not in data.shape:
+        return [data]
+    return [one for part in data.unbind(data.shape.index(-1) - 1) for one in _even(part)]
 
 
 def _time_last(data: TensorDictBase) -> TensorDictBase:
