@@ -41,10 +41,13 @@ def test_one_call_from_a_policy_to_a_robust_one(robust):
 
 
 @pytest.mark.filterwarnings("ignore:the model is too poor")
-def test_the_generator_of_the_caller_is_left_alone():
+@pytest.mark.parametrize(
+    "env", ["inverted_pendulum", lambda: make_env("inverted_pendulum", 2)], ids=["name", "function"]
+)
+def test_the_generator_of_the_caller_is_left_alone(env):
     torch.manual_seed(5)
     before = torch.random.get_rng_state()
-    made = [robustify("inverted_pendulum", balance, 60, fit=QUICK, **TINY) for _ in range(2)]
+    made = [robustify(env, balance, 60, fit=QUICK, **TINY) for _ in range(2)]
     assert torch.equal(torch.random.get_rng_state(), before)
     for one, other in zip(*(made[i].model.parameters() for i in (0, 1)), strict=True):
         assert torch.equal(one, other)

@@ -351,8 +351,9 @@ def robustify(
     check_not_negative("noise", noise)
     if dt is not None:
         check_positive("dt", dt)
-    source = _source(make_env, policy)
-    dt = source.time_step() if dt is None else dt
+    with _private_randomness():  # environments may draw a seed as they are made
+        source = _source(make_env, policy)
+        dt = source.time_step() if dt is None else dt
     if dt is None:
         raise ValueError(
             f"{source.name or 'the environment'} does not tell the time of its steps: give dt "
