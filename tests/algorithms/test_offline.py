@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from torchrl_l1.algorithms import (
     ModelConfig,
@@ -138,6 +139,17 @@ def test_the_first_policy_acts_as_the_data_do() -> None:
         # Its own return: TRPO has changed next to nothing.
         assert metrics["clone/return"] == pytest.approx(metrics["return_deterministic"], rel=1e-2)
     assert found[True] < 0.3 < 1 < found[False]
+
+
+def test_data_may_be_a_buffer_or_several() -> None:
+    data = recorded()
+    buffer = ReplayBuffer(storage=LazyTensorStorage(len(data.reshape(-1))))
+    buffer.extend(data.reshape(-1))
+    made = [make(data=one) for one in (data, buffer, lambda: [data])]
+    for one in made:
+        one.prepare()
+    rows = [one.learning.buffer[:]["observation"] for one in made]
+    assert torch.equal(rows[0], rows[1]) and torch.equal(rows[0], rows[2])
 
 
 def test_rows_that_are_not_finite_are_counted_and_left_out() -> None:

@@ -16,6 +16,7 @@ from typing import Any, Unpack
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torchrl.data import ReplayBuffer
 
 from torchrl_l1.algorithms.algorithm import (
     COMMON_METRICS,
@@ -45,6 +46,7 @@ from torchrl_l1.algorithms.policy_improvement import (
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import read_transitions
 from torchrl_l1.dynamics.network import model_precision
+from torchrl_l1.dynamics.transitions import Data
 from torchrl_l1.envs import AnyTask, Perturbation, action_bounds
 
 OFFLINE_METRICS: dict[str, str] = {
@@ -132,7 +134,7 @@ class Offline(Algorithm):
         l1: L1Config | None = None,
         perturbation: Perturbation | None = None,
         *,
-        data: TensorDictBase | Callable[[], TensorDictBase] | None = None,
+        data: Data | Callable[[], Data] | None = None,
         **surroundings: Unpack[Surroundings],
     ) -> None:
         super().__init__(task, config, l1, perturbation, **surroundings)
@@ -172,10 +174,13 @@ class Offline(Algorithm):
         if self.data is None:
             raise ValueError("offline learning needs a dataset: set dataset=...")
         data = self.data() if callable(self.data) else self.data
-        label = self.config.label
-        executed = label == "executed" and "executed" in data.keys()  # noqa: SIM118
+        if isinstance(data, ReplayBuffer):
+            data = data[:] if len(data) else []
+        parts = [data] if isinstance(data, TensorDictBase) else list(data)
+        told = all("executed" in part.keys() for part in parts)  # noqa: SIM118
+        executed = self.config.label == "executed" and told
         read = read_transitions(
-            data,
+            parts,
             action_key="executed" if executed else "action",
             dtype=torch.get_default_dtype(),
         )
