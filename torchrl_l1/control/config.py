@@ -42,7 +42,8 @@ class L1Config:
     r"""Settings of the L1 adaptive controller (arXiv 2403.14860, sections 3.1 and 3.2).
 
     The defaults are those of the paper's Algorithms 1 and 2; :meth:`reference` gives the
-    settings of the authors' released controller.
+    settings of the authors' released controller, and :meth:`robust` those of the controller
+    that weighs what the model misses by its covariance and acts on what is significant.
 
     Args:
         dt: sampling time :math:`T_s`: the time of one environment step, in seconds.
