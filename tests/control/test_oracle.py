@@ -102,6 +102,14 @@ def test_nested_chains_are_searched_too() -> None:
     assert received.last.unique().tolist() == [1.0]
 
 
+def test_environments_inside_are_searched_too() -> None:
+    inner, received = environment(shifted(0.5))
+    middle = TransformedEnv(inner, scaled(2.0), auto_unwrap=False)
+    env = TransformedEnv(middle, OracleTransform(), auto_unwrap=False)
+    assert stepped(env, 1.0)["next", "l1", "u_exec"].unique().tolist() == [0.25]
+    assert received.last.unique().tolist() == [1.0]
+
+
 def test_episodes_of_a_cancelled_bias_are_those_without_it() -> None:
     def feedback(observation: Tensor) -> Tensor:
         return 8.0 * observation[..., 1:2]

@@ -13,16 +13,30 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, GymEnv, Transform, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    FrameSkipTransform,
+    GymEnv,
+    MultiAction,
+    NoopResetEnv,
+    PendulumEnv,
+    Transform,
+    TransformedEnv,
+)
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_l1.envs import (
+    ActionNoise,
     ActuatorBias,
     ActuatorDelay,
     ActuatorGain,
     DeadZone,
     FailingMotor,
+    ObservationNoise,
     RandomSigns,
+    SensorBias,
+    SensorDelay,
     SineBias,
     StepBias,
     Stiction,
@@ -225,6 +239,75 @@ def test_on_gymnasium_batched_and_not(transform: Transform):
     many.close()
     again = pickle.loads(pickle.dumps(transform))
     assert repr(again) == repr(transform)
+
+
+def test_environments_of_any_batch_have_values_of_their_own():
+    params = PendulumEnv.gen_params(batch_size=[64])
+    env = TransformedEnv(PendulumEnv(), ActuatorBias(RandomSigns(0.3)))
+    zero = env.reset(params, set_state=True).set("action", torch.zeros(64, 1))
+    speeds = env.step(zero)["next", "thdot"] - PendulumEnv().step(zero)["next", "thdot"]
+    assert (speeds > 0).any() and (speeds < 0).any()
+    rows = torch.linspace(-1, 1, 64).unsqueeze(-1)
+    env = TransformedEnv(PendulumEnv(), ActuatorBias(rows))
+    zero = env.reset(params, set_state=True).set("action", torch.zeros(64, 1))
+    speeds = env.step(zero)["next", "thdot"]
+    same = PendulumEnv().step(zero.set("action", rows))["next", "thdot"]
+    torch.testing.assert_close(speeds, same)
+
+
+STEPPING = {
+    "frames": lambda: FrameSkipTransform(3),
+    "chunks": MultiAction,
+    "noops": lambda: NoopResetEnv(2),
+}
+ALWAYS, IN_FRAMES, NEVER = {"frames", "chunks", "noops"}, {"frames"}, set()
+
+
+@pytest.mark.parametrize(
+    ("make", "refused"),
+    [
+        (lambda: ActuatorBias(0.1), IN_FRAMES),
+        (lambda: ActuatorBias(RandomSigns(0.1)), ALWAYS),
+        (lambda: ActuatorDelay(1), ALWAYS),
+        (lambda: ActionNoise(0.1), IN_FRAMES),
+        (lambda: SensorDelay(1), ALWAYS),
+        (lambda: SensorBias(0.1), NEVER),
+        (lambda: ObservationNoise(0.1), NEVER),
+    ],
+)
+@pytest.mark.parametrize("kind", STEPPING)
+def test_what_steps_the_environment_itself_comes_before_or_around(make, refused, kind):
+    def chain(*transforms):
+        return TransformedEnv(Echo((1,)), Compose(*transforms))
+
+    later = STEPPING[kind]()
+    name = type(later).__name__
+    if kind in refused:
+        with pytest.raises(ValueError, match=f"{name} comes after {type(make()).__name__} and"):
+            chain(make(), later).reset()
+        appended = chain(make())
+        appended.reset()
+        appended.append_transform(STEPPING[kind]())
+        with pytest.raises(ValueError, match=f"put {name} before"):
+            appended.reset()
+    else:
+        chain(make(), later).reset()
+    chain(STEPPING[kind](), make()).reset()
+    TransformedEnv(chain(make()), STEPPING[kind](), auto_unwrap=False).reset()
+
+
+def test_frames_around_a_disturbance_are_disturbed_once_each():
+    class Sums(Echo):
+        def _step(self, tensordict: TensorDict) -> TensorDict:
+            received.append(tensordict["action"].flatten().tolist())
+            return super()._step(tensordict)
+
+    received: list[list[float]] = []
+    inner = TransformedEnv(Sums((1,)), Compose(ActuatorDelay(1), ActuatorBias(0.5)))
+    env = TransformedEnv(inner, FrameSkipTransform(3), auto_unwrap=False)
+    env.reset()
+    send(env, torch.full((1, 2), 0.25).double())
+    assert received == [[0.0, 0.0], [0.75, 0.75], [0.75, 0.75]]
 
 
 def test_copies_have_a_state_of_their_own():

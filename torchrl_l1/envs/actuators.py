@@ -48,8 +48,12 @@ class _Actuator(HeldDisturbance):
     ) -> TensorDictBase:
         parent = self.parent
         if parent is not None:
-            action = parent.full_action_spec[self.key].zero()
+            spec = parent.full_action_spec[self.key]
+            # An environment that is not batch-locked decides on more dimensions at reset.
+            extra = tensordict_reset.batch_size[: tensordict_reset.ndim - len(parent.batch_size)]
+            action = spec.zero(extra)
             self._restart(action, tensordict.get("_reset", None))
+            self.check_order(bool(self._state))
         return tensordict_reset
 
     _reset_on_native_autoreset = _reset

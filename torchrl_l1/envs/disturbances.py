@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.envs import Transform
+from torchrl.envs import FrameSkipTransform, MultiAction, NoopResetEnv, Transform
 
 Draw = Callable[[torch.Size], Tensor]
 """Makes values of a shape: for each environment, drawn again whenever that environment resets."""
@@ -63,6 +63,33 @@ class EnvironmentTransform(Transform):
     """A transform of environments, with the reason why stored data must not pass it."""
 
     reason: ClassVar[str]
+    disturbs: ClassVar[str]
+
+    def check_order(self, remembers: bool) -> None:
+        """Refuse transforms after this one that step the environment through copies of it.
+
+        A frame skip also hands its copies an action that is disturbed already.
+
+        Args:
+            remembers: whether this one has a state, which copies would not share.
+
+        Raises:
+            ValueError: naming the transform and the right order.
+        """
+        environment = self.container
+        if environment is None:
+            return
+        chain = list(environment.transform.modules())
+        for later in chain[next(i for i, member in enumerate(chain) if member is self) + 1 :]:
+            skips = isinstance(later, FrameSkipTransform) and later.frame_skip > 1
+            steps = skips or isinstance(later, (MultiAction, NoopResetEnv))
+            if steps and (remembers or (skips and self.disturbs == "action")):
+                mine, other = type(self).__name__, type(later).__name__
+                raise ValueError(
+                    f"{other} comes after {mine} and steps the environment through copies of what "
+                    f"is before it, which would disturb it in another way: put {other} before "
+                    f"{mine}, or around it, TransformedEnv(env, {other}(...), auto_unwrap=False)"
+                )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Refuse to work on stored data.

@@ -86,6 +86,12 @@ class ActionNoise(_UniformNoise):
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.set(self.key, self._noisy(tensordict.get(self.key)))
 
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        self.check_order(remembers=False)
+        return tensordict_reset
+
 
 class ObservationNoise(_UniformNoise):
     r"""Noise :math:`U(-w, w)` on the observation after a step, independent per entry and step.

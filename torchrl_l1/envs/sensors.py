@@ -43,6 +43,7 @@ class _Sensor(HeldDisturbance):
     ) -> TensorDictBase:
         reading, reset = tensordict_reset.get(self.key), tensordict.get("_reset", None)
         self._restart(reading, reset)
+        self.check_order(bool(self._state))
         seen = self._first(reading)
         if reset is not None:
             # The others' entries are those that they had, disturbed already.
