@@ -320,6 +320,19 @@ def test_copies_have_a_state_of_their_own():
 
 
 @pytest.mark.parametrize(
+    "draw",
+    [
+        lambda shape: torch.tensor(0.3),
+        lambda shape: torch.rand(shape[:-1]),
+        lambda shape: torch.full(shape, torch.nan),
+    ],
+)
+def test_draws_that_fit_no_environment_are_refused(draw):
+    with pytest.raises(ValueError, match="ActuatorBias drew values of shape"):
+        TransformedEnv(Echo((2,), 2), ActuatorBias(draw)).reset()
+
+
+@pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: SineBias(0.1, period=0), "period must be positive"),

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.envs import FrameSkipTransform, MultiAction, NoopResetEnv, Transform
 
 Draw = Callable[[torch.Size], Tensor]
-"""Makes values of a shape: for each environment, drawn again whenever that environment resets."""
+"""Makes values of a shape, or with one for all entries: drawn again as that environment resets."""
 
 Value = float | Sequence[float] | Tensor | Draw
 """A number, one for each entry, one for each environment ``(*batch, 1 or entries)``, or drawn."""
@@ -142,6 +142,11 @@ class HeldDisturbance(EnvironmentTransform):
         if self.draw is None:
             return {}
         value = self.draw(entry.shape).to(entry.device)
+        if value.shape not in (entry.shape, (*entry.shape[:-1], 1)) or not value.isfinite().all():
+            raise ValueError(
+                f"{type(self).__name__} drew values of shape {tuple(value.shape)}, expected finite "
+                f"ones of shape {tuple(entry.shape)}, or {(*entry.shape[:-1], 1)}"
+            )
         self._check(value)
         return {"value": value}
 
