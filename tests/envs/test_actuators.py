@@ -26,11 +26,13 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
+from torchrl_l1.control import ActionJacobian, L1Transform, OracleTransform
 from torchrl_l1.envs import (
     ActionNoise,
     ActuatorBias,
     ActuatorDelay,
     ActuatorGain,
+    BatchedMujocoEnv,
     DeadZone,
     FailingMotor,
     ObservationNoise,
@@ -294,6 +296,20 @@ def test_what_steps_the_environment_itself_comes_before_or_around(make, refused,
         chain(make(), later).reset()
     chain(STEPPING[kind](), make()).reset()
     TransformedEnv(chain(make()), STEPPING[kind](), auto_unwrap=False).reset()
+
+
+@pytest.mark.parametrize("make", [lambda: ActuatorBias(0.1), lambda: ActionNoise(0.1)])
+@pytest.mark.parametrize("auto_unwrap", [False, True])
+def test_a_controller_inside_is_refused(make, auto_unwrap):
+    inside = TransformedEnv(BatchedMujocoEnv("inverted_pendulum", 2), OracleTransform())
+    outside = TransformedEnv(inside, make(), auto_unwrap=auto_unwrap)
+    with pytest.raises(ValueError, match=r"comes after OracleTransform, so that .*: put A"):
+        outside.reset()
+    model = ActionJacobian(lambda x, u: x + u)
+    inside = TransformedEnv(BatchedMujocoEnv("inverted_pendulum", 2), L1Transform(model))
+    with pytest.raises(ValueError, match="comes after L1Transform"):
+        TransformedEnv(inside, make(), auto_unwrap=auto_unwrap).reset()
+    TransformedEnv(inside, ObservationNoise(0.0), auto_unwrap=False).reset()
 
 
 def test_frames_around_a_disturbance_are_disturbed_once_each():

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.wrappers import TimeLimit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torchrl.envs import GymEnv, StepCounter, TransformedEnv
@@ -210,6 +211,15 @@ def test_what_an_environment_does_not_tell_is_asked_for():
         get_task("gymnasium/Pendulum-v1", dt=0.1)
     with pytest.raises(ValueError, match="leave dt out"):
         get_task("half_cheetah", dt=1.0)
+
+
+def test_of_several_time_limits_the_shortest_counts():
+    for limits in ((200, 300), (300, 200)):
+
+        def make(limits=limits):
+            return TimeLimit(TimeLimit(Cart(), limits[0]), limits[1])
+
+        assert ExternalTask(environment_source(make)).horizon == 200
 
 
 def test_own_tasks_stay_what_they_are():

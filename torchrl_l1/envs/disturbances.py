@@ -9,7 +9,9 @@ from typing import ClassVar
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.envs import FrameSkipTransform, MultiAction, NoopResetEnv, Transform
+from torchrl.envs import FrameSkipTransform, MultiAction, NoopResetEnv, Transform, TransformedEnv
+
+from torchrl_l1.control import L1Transform, OracleTransform
 
 Draw = Callable[[torch.Size], Tensor]
 """Makes values of a shape, or with one for all entries: drawn again as that environment resets."""
@@ -66,9 +68,11 @@ class EnvironmentTransform(Transform):
     disturbs: ClassVar[str]
 
     def check_order(self, remembers: bool) -> None:
-        """Refuse transforms after this one that step the environment through copies of it.
+        """Refuse transforms before or after this one, with which it would not do what it says.
 
-        A frame skip also hands its copies an action that is disturbed already.
+        A controller before it, or in a transformed environment inside, takes a disturbed action for
+        the policy's. Some transforms after it step the environment through copies of it; a frame
+        skip also hands these an action that is disturbed already.
 
         Args:
             remembers: whether this one has a state, which copies would not share.
@@ -79,12 +83,24 @@ class EnvironmentTransform(Transform):
         environment = self.container
         if environment is None:
             return
-        chain = list(environment.transform.modules())
-        for later in chain[next(i for i, member in enumerate(chain) if member is self) + 1 :]:
+        mine, chain = type(self).__name__, list(environment.transform.modules())
+        place = next(index for index, member in enumerate(chain) if member is self)
+        before, inside = chain[:place], environment.base_env
+        while isinstance(inside, TransformedEnv):
+            before += inside.transform.modules()
+            inside = inside.base_env
+        for earlier in before if self.disturbs == "action" else ():
+            if isinstance(earlier, (L1Transform, OracleTransform)):
+                other = type(earlier).__name__
+                raise ValueError(
+                    f"{mine} comes after {other}, so that it disturbs the policy's action and not "
+                    f"what {other} sends to the actuators: put {mine} before {other}"
+                )
+        for later in chain[place + 1 :]:
             skips = isinstance(later, FrameSkipTransform) and later.frame_skip > 1
             steps = skips or isinstance(later, (MultiAction, NoopResetEnv))
             if steps and (remembers or (skips and self.disturbs == "action")):
-                mine, other = type(self).__name__, type(later).__name__
+                other = type(later).__name__
                 raise ValueError(
                     f"{other} comes after {mine} and steps the environment through copies of what "
                     f"is before it, which would disturb it in another way: put {other} before "
