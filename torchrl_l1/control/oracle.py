@@ -10,7 +10,13 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.envs.transforms import Transform
+from torchrl.envs.transforms import (
+    ActionScaling,
+    Compose,
+    DeviceCastTransform,
+    DTypeCastTransform,
+    Transform,
+)
 
 from torchrl_l1.control.layout import L1_KEY, required_entry
 
@@ -48,6 +54,8 @@ class OracleTransform(Transform):
         key: name of the nested tensordict with the executed input.
 
     Raises:
+        ValueError: at a reset, if a transform that maps actions to other units stands between a
+            disturbance and the oracle.
         KeyError: at a step, if there is no action.
         RuntimeError: if used in a replay buffer.
 
@@ -107,6 +115,7 @@ class OracleTransform(Transform):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         # Partial resets are merged by the environment, which discards the rows not reset.
+        list(self._compensations())
         action = self._action_spec()
         extra = tensordict_reset.batch_size[: tensordict_reset.ndim - action.ndim + 1]
         nothing = torch.zeros(*extra, *action.shape, dtype=action.dtype, device=action.device)
@@ -145,13 +154,26 @@ class OracleTransform(Transform):
         while isinstance(environment, TransformedEnv):
             chains.append(environment.transform)
             environment = environment.base_env
-        for chain in reversed(chains):
-            for transform in chain.modules():
-                if transform is self:
-                    return
-                compensate = getattr(transform, "compensate", None)
-                if compensate is not None:
-                    yield compensate
+        undone = ""
+        for transform in (member for chain in reversed(chains) for member in chain.modules()):
+            if transform is self:
+                return
+            compensate = getattr(transform, "compensate", None)
+            if compensate is not None:
+                undone = type(transform).__name__
+                yield compensate
+            elif undone and self._changes_units(transform):
+                name = type(transform).__name__
+                raise ValueError(
+                    f"{name} stands between {undone} and OracleTransform, which would undo the one "
+                    f"in the units of the other: put {name} after OracleTransform"
+                )
+
+    def _changes_units(self, transform: object) -> bool:
+        if isinstance(transform, (Compose, DTypeCastTransform, DeviceCastTransform)):
+            return False
+        keys = getattr(transform, "in_keys_inv", None) or ()
+        return isinstance(transform, ActionScaling) or self.action_key in map(unravel_key, keys)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(key={self.key!r})"
