@@ -152,8 +152,8 @@ class L1Primer(TensorDictPrimer):
         self._layout = replace(layout, **floating)
         if self._layout != layout:
             primers = Composite({self.key: self._layout.state_spec(self._shared.settings.config)})
-            device = self.primers.device
-            self.primers = primers if device is None else primers.to(device)
+            device: torch.device | None = self.device
+            self.primers: Composite = primers if device is None else primers.to(device)
             self._signals = self._layout.signal_spec(self._diagnostics)
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
