@@ -61,6 +61,14 @@ class Uniform:
         return self.low + (self.high - self.low) * torch.rand(shape)
 
 
+def where_stepped(tensordict: TensorDictBase, key: NestedKey, seen: Tensor) -> Tensor:
+    """What is seen after a step; before it where a ``"_step"`` mask leaves an environment out."""
+    stepped, before = tensordict.get("_step", None), tensordict.get(key, None)
+    if stepped is None or before is None:
+        return seen
+    return torch.where(stepped.reshape(*seen.shape[:-1], -1).any(-1, keepdim=True), seen, before)
+
+
 class EnvironmentTransform(Transform):
     """A transform of environments, with the reason why stored data must not pass it."""
 

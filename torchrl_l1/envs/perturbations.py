@@ -23,7 +23,7 @@ from torchrl_l1.envs.actuators import (
     Stiction,
     WalkBias,
 )
-from torchrl_l1.envs.disturbances import EnvironmentTransform, RandomSigns
+from torchrl_l1.envs.disturbances import EnvironmentTransform, RandomSigns, where_stepped
 from torchrl_l1.envs.plant import check_plant
 from torchrl_l1.envs.sensors import SensorBias, SensorDelay, SensorDropout
 
@@ -114,7 +114,8 @@ class ObservationNoise(_UniformNoise):
         super().__init__(half_width, observation_key)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict.set(self.key, self._noisy(next_tensordict.get(self.key)))
+        noisy = self._noisy(next_tensordict.get(self.key))
+        return next_tensordict.set(self.key, where_stepped(tensordict, self.key, noisy))
 
 
 # Key of the metadata of a field.
