@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import (
     Compose,
+    ConditionalSkip,
     EnvBase,
     FrameSkipTransform,
     GymEnv,
@@ -310,6 +311,24 @@ def test_a_controller_inside_is_refused(make, auto_unwrap):
     with pytest.raises(ValueError, match="comes after L1Transform"):
         TransformedEnv(inside, make(), auto_unwrap=auto_unwrap).reset()
     TransformedEnv(inside, ObservationNoise(0.0), auto_unwrap=False).reset()
+
+
+@pytest.mark.parametrize("rows", [[True, False], [False, False]])
+def test_a_step_that_is_skipped_changes_no_state(rows):
+    stepped = torch.tensor(rows).unsqueeze(-1)
+    never = torch.zeros_like(stepped)
+    for order in (1, -1):
+        decisions = iter([never, ~stepped, never, never])
+        skip = ConditionalSkip(lambda _, decisions=decisions: next(decisions))
+        env = TransformedEnv(Echo((2,), 1), Compose(*[skip, ActuatorDelay(1)][::order]))
+        state, received = env.reset(), []
+        for sent in (0.1, 0.2, 0.3, 0.4):
+            data = env.step(state.set("action", torch.full((2, 1), sent).double()))
+            received.append(data["next", "observation"][:, 0])
+            state = env.step_mdp(data)
+        expected = [0.2 if row else 0.1 for row in rows]
+        assert received[2].tolist() == pytest.approx(expected)
+        assert received[3].tolist() == pytest.approx([0.3, 0.3])
 
 
 def test_frames_around_a_disturbance_are_disturbed_once_each():

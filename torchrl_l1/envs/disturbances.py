@@ -150,6 +150,7 @@ class HeldDisturbance(EnvironmentTransform):
             self._check(tensor)
         self.register_buffer("value", tensor)
         self._state: Mapping[str, Tensor] = {}
+        self._following: Mapping[str, Tensor] = {}
 
     def _check(self, value: Tensor) -> None:
         """Refuse values that the disturbance cannot have."""
