@@ -22,6 +22,7 @@ from torchrl.envs import (
     MultiAction,
     NoopResetEnv,
     PendulumEnv,
+    SerialEnv,
     Transform,
     TransformedEnv,
 )
@@ -311,6 +312,9 @@ def test_a_controller_inside_is_refused(make, auto_unwrap):
     with pytest.raises(ValueError, match="comes after L1Transform"):
         TransformedEnv(inside, make(), auto_unwrap=auto_unwrap).reset()
     TransformedEnv(inside, ObservationNoise(0.0), auto_unwrap=False).reset()
+    many = SerialEnv(2, lambda: TransformedEnv(Echo((1,)), OracleTransform()))
+    with pytest.raises(ValueError, match="comes after OracleTransform"):
+        TransformedEnv(many, make()).reset()
 
 
 @pytest.mark.parametrize("rows", [[True, False], [False, False]])

@@ -9,7 +9,14 @@ from typing import ClassVar
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.envs import FrameSkipTransform, MultiAction, NoopResetEnv, Transform, TransformedEnv
+from torchrl.envs import (
+    FrameSkipTransform,
+    MultiAction,
+    NoopResetEnv,
+    SerialEnv,
+    Transform,
+    TransformedEnv,
+)
 
 from torchrl_l1.control import L1Transform, OracleTransform
 
@@ -94,9 +101,12 @@ class EnvironmentTransform(Transform):
         mine, chain = type(self).__name__, list(environment.transform.modules())
         place = next(index for index, member in enumerate(chain) if member is self)
         before, inside = chain[:place], environment.base_env
-        while isinstance(inside, TransformedEnv):
-            before += inside.transform.modules()
-            inside = inside.base_env
+        while isinstance(inside, (TransformedEnv, SerialEnv)):
+            if isinstance(inside, SerialEnv):
+                inside = next(iter(inside.__dict__.get("_envs", [])), None)
+            else:
+                before += inside.transform.modules()
+                inside = inside.base_env
         for earlier in before if self.disturbs == "action" else ():
             if isinstance(earlier, (L1Transform, OracleTransform)):
                 other = type(earlier).__name__
