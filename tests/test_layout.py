@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import ast
+import subprocess
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "torchrl_l1"
@@ -63,6 +66,21 @@ def test_the_size_of_the_house() -> None:
     every = [file for place in PLACES for file in (ROOT / place).rglob("*.py")]
     long = {str(file): len(file.read_text(encoding="utf-8").splitlines()) for file in every}
     assert not {file: lines for file, lines in long.items() if lines > MOST_LINES}
+
+
+def test_nothing_lies_about_that_is_no_part_of_the_project() -> None:
+    if not (ROOT / ".git").exists():
+        pytest.skip("no clone")
+    command = ["git", "ls-files", "-z"]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    files = [name for name in listed.split("\0") if name]
+    folders = {"torchrl_l1", "recipes", "tests", "docs", "benchmarks", ".ci", ".github"}
+    texts = {"README.md", "LICENSE", "CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff"}
+    tools = {"pyproject.toml", "constraints.txt", "Makefile", ".pre-commit-config.yaml"}
+    assert {name.split("/")[0] for name in files} <= folders | texts | tools | {".gitignore"}
+    kinds = {Path(name).suffix for name in files if not name.startswith(".")}
+    code, prose = {".py", ".typed"}, {".md", ".txt", ".cff", ""}
+    assert kinds <= code | prose | {".csv", ".json", ".png", ".toml", ".xml", ".yaml"}
 
 
 def test_imports_point_one_way() -> None:

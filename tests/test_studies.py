@@ -204,3 +204,72 @@ def test_what_chance_makes_of_a_single_seed_is_quoted() -> None:
     for page in ("index", "table1"):
         text = (ROOT / f"docs/studies/{page}.md").read_text()
         assert all(value in text for value in (*returns, added)), page
+
+
+DISTURBANCES = {
+    "actuator delay": "delays",
+    "sensor delay": "delays",
+    "sensor bias": "offset of the sensors",
+    "body mass": "heavier bodies",
+    "wind force": "wind",
+    "dead zone": "dead zone",
+    "joint damping": "changed damping",
+    "step bias": "begins in mid-episode",
+}
+
+
+def test_suite_page_names_whatever_the_robust_controller_makes_worse() -> None:
+    text = " ".join(section("docs/studies/suite.md", "**In short.**").split())
+    first = text.partition("## ")[0].partition("The paper's")[0].replace("late sensor", "delays")
+    for row in rows((RESULTS / "suite/verdicts.md").read_text()):
+        for column, verdicts in row.items():
+            if verdicts.endswith("/ worse"):
+                task = column.partition(" (")[0].title().replace(" ", "")
+                of_task = first.partition(task)[2]
+                assert DISTURBANCES[row["disturbance"]] in of_task, (task, row["disturbance"])
+
+
+OTHER_POLICIES = {("920", "1333"), ("857", "759")}
+
+
+def test_suite_page_quotes_its_tables() -> None:
+    text = section("docs/studies/suite.md", "## Disturbance by disturbance")
+    quoted = re.findall(r"(-?\d[\d.]*) to (-?\d[\d.]*)\b", text.partition("## Why less push")[0])
+    assert len(set(quoted)) > 10 and set(quoted) > OTHER_POLICIES
+    tables = [row for task in TASKS for row in rows((RESULTS / f"suite/{task}.md").read_text())]
+
+    def in_a_table(off: str, on: str) -> bool:
+        half = 0.5001 if "." not in off else 0.05001  # of the last digit
+        return any(
+            abs(float(row["off"]) - float(off)) <= half
+            and min(abs(float(row[l1]) - float(on)) for l1 in ("paper", "robust")) <= half
+            for row in tables
+        )
+
+    assert {pair for pair in quoted if not in_a_table(*pair)} == OTHER_POLICIES
+
+
+def test_theorem_page_quotes_the_residuals_of_the_tasks() -> None:
+    with (RESULTS / "theorem1/tasks.csv").open(newline="") as handle:
+        tasks = {row["task"]: row for row in csv.DictReader(handle)}
+    ratios = [float(row["residual_largest"]) / float(row["residual_0.5"]) for row in tasks.values()]
+    text = " ".join(section("docs/studies/theorem.md", "# Theorem 1, measured").split())
+    assert f"is {min(ratios):.0f} to {round(max(ratios), -1):.0f} times the median one" in text
+    shares = {task: float(row["below_two_epsilon_a"]) for task, row in tasks.items()}
+    walker = shares.pop("walker")
+    quoted = f"({walker:.0%} of the residuals on Walker, {min(shares.values()):.0%} and more"
+    assert quoted.replace("%", " %") in text
+
+
+def test_offline_page_and_the_advice_quote_what_robust_costs_hopper() -> None:
+    found = {
+        row["data"]: {l1: float(row[l1].split()[0]) for l1 in ("off", "robust")}
+        for row in rows((RESULTS / "offline/returns.md").read_text())
+        if (row["task"], row["bias"]) == ("hopper", "none") and row["data"] != "random"
+    }
+    text = " ".join((ROOT / "docs/studies/offline.md").read_text().split())
+    for of in found.values():
+        assert f"{of['robust']:.0f} against {of['off']:.0f}" in text
+        assert 0.55 < 1 - of["robust"] / of["off"] < 0.65
+    for page in ("README.md", "docs/studies/index.md", "docs/studies/offline.md"):
+        assert "three fifths" in (ROOT / page).read_text(), page

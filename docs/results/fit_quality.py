@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.ticker import LogLocator
 from scipy.linalg import solve_discrete_are
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
@@ -285,10 +286,11 @@ def draw(rows: Sequence[Row], file: Path) -> None:
             axis.set_xlim(-1, 1.05)
         else:
             axis.set_xscale("log")
+            axis.xaxis.set_major_locator(LogLocator(numticks=5))
         axis.axhline(0, color="0.6", lw=0.8)
         axis.set_title(plant, fontsize=9)
         axis.set_xlabel(MEASURES[measure].split(",")[0], fontsize=8)
-        axis.set_ylabel("share regained", fontsize=8)
+        axis.set_ylabel("share regained (at least -1)", fontsize=8)
     legend_below(figure, axes)
     save(figure, file)
 

@@ -24,9 +24,10 @@ from torchrl_l1.experiment.evaluate import TrainedRun, load_run, make_collection
 from torchrl_l1.experiment.files import write_table
 from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.report.page import markdown
+from torchrl_l1.report.style import color
 
 HERE = Path(__file__).parent
-CONTROLLERS = {"off": "#999999", "paper": "#d55e00", "robust": "#0072b2", "oracle": "#000000"}
+CONTROLLERS = {l1: color(0, l1) for l1 in ("off", "paper", "robust", "oracle")}
 BIASES = (0.0, -0.4, 0.4)
 FALLEN = 0.7
 EPISODES, SEED = 24, 0
@@ -89,11 +90,11 @@ def draw(rows: Sequence[Row]) -> None:
     figure, axes = plt.subplots(1, len(BIASES), figsize=(9, 3.2), sharey=True)
     rng = np.random.default_rng(0)
     for axis, bias in zip(axes, BIASES, strict=True):
-        for place, (controller, color) in enumerate(CONTROLLERS.items()):
+        for place, (controller, colour) in enumerate(CONTROLLERS.items()):
             values = [r["return"] for r in rows if (r["l1"], r["bias"]) == (controller, bias)]
             jitter = place + rng.uniform(-0.2, 0.2, len(values))
-            axis.plot(jitter, values, "o", ms=3, alpha=0.5, color=color)
-            axis.plot([place - 0.3, place + 0.3], [np.median(values)] * 2, color=color, lw=2)
+            axis.plot(jitter, values, "o", ms=3, alpha=0.5, color=colour)
+            axis.plot([place - 0.3, place + 0.3], [np.median(values)] * 2, color=colour, lw=2)
         axis.set_title(f"bias {bias:g}")
         axis.set_xticks(range(len(CONTROLLERS)), list(CONTROLLERS))
         axis.spines[["top", "right"]].set_visible(False)

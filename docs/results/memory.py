@@ -22,6 +22,7 @@ from tqdm import tqdm
 from torchrl_l1 import EnsembleDynamics, L1Config, L1Transform
 from torchrl_l1.envs import get_task, make_env
 from torchrl_l1.experiment.files import write_table
+from torchrl_l1.report.style import color
 
 HERE = Path(__file__).parent
 ENVIRONMENTS = 4096
@@ -82,7 +83,7 @@ def draw() -> None:
     figure, ax = plt.subplots(figsize=(7, 3.2), layout="constrained")
     for name in CONTROLLERS:
         points = [(int(r["step"]), float(r["mebibytes"])) for r in rows if r["l1"] == name]
-        ax.plot(*zip(*points, strict=True), label=f"L1 {name}")
+        ax.plot(*zip(*points, strict=True), color=color(0, name), label=f"L1 {name}")
         half = [value for step, value in points if step >= points[-1][0] / 2]
         print(f"L1 {name}: {half[0]:.0f} MiB at half of the steps, {half[-1]:.0f} MiB at the end")
     ax.set_xlabel(f"steps of {ENVIRONMENTS} environments")

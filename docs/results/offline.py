@@ -22,11 +22,12 @@ import numpy as np
 from torchrl_l1.experiment.files import write_table
 from torchrl_l1.experiment.run_directory import read_config
 from torchrl_l1.report.page import markdown, number
+from torchrl_l1.report.style import color, title
 
 HERE = Path(__file__).parent / "offline"
 TASKS = ("inverted_pendulum", "half_cheetah", "hopper")
 QUALITIES = ("random", "medium", "expert")
-CONTROLLERS = {"off": "#999999", "paper": "#d55e00", "robust": "#0072b2", "oracle": "#000000"}
+CONTROLLERS = {l1: color(0, l1) for l1 in ("off", "paper", "robust", "oracle")}
 RESAMPLES = 2000
 Row = dict[str, Any]
 
@@ -209,7 +210,7 @@ def draw(summary: Sequence[Row]) -> None:
     )
     for line, task in zip(axes, tasks, strict=True):
         for axis, quality in zip(line, QUALITIES, strict=True):
-            for l1, color in CONTROLLERS.items():
+            for l1, colour in CONTROLLERS.items():
                 cell = [
                     row
                     for row in select(summary, task=task, quality=quality, l1=l1)
@@ -220,9 +221,9 @@ def draw(summary: Sequence[Row]) -> None:
                     [row[f"return_{name}"] for row in cell] for name in ("low", "mean", "high")
                 )
                 style = "--" if l1 == "oracle" else "-"
-                axis.plot(biases, mean, style, marker="o", ms=3, color=color, label=l1)
-                axis.fill_between(biases, low, high, color=color, alpha=0.12, linewidth=0)
-            axis.set_title(f"{task}, {quality} data", fontsize=9)
+                axis.plot(biases, mean, style, marker="o", ms=3, color=colour, label=l1)
+                axis.fill_between(biases, low, high, color=colour, alpha=0.12, linewidth=0)
+            axis.set_title(f"{title(task)}, {quality} data", fontsize=9)
             if not select(summary, task=task, quality=quality):
                 axis.text(0.5, 0.5, "not run", ha="center", transform=axis.transAxes)
                 axis.set_axis_off()
@@ -231,7 +232,7 @@ def draw(summary: Sequence[Row]) -> None:
             axis.grid(alpha=0.3)
         line[0].set_ylabel("return")
     for axis in axes[-1]:
-        axis.set_xlabel("actuator bias")
+        axis.set_xlabel("actuator bias (action units)")
     axes[0][0].legend(fontsize=8)
     figure.tight_layout()
     figure.savefig(HERE / "returns.png", dpi=110)

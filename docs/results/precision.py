@@ -99,6 +99,11 @@ def _line(
     }
 
 
+def _some(value: float, _: int) -> str:
+    """Labels of ticks between powers of ten, of those that have room."""
+    return f"{value:g}" if f"{value:e}"[0] in "235" else ""
+
+
 def draw(runs: Runs) -> None:
     """Returns and validation losses over real steps, a column per recipe."""
     recipes = list(dict.fromkeys(key[0] for key in runs))
@@ -116,8 +121,8 @@ def draw(runs: Runs) -> None:
     for upper, lower in axes.T:
         if all(line.get_ydata().min() > 0 for line in lower.lines):
             lower.set_yscale("log")
-            for axis in (lower.yaxis.set_major_formatter, lower.yaxis.set_minor_formatter):
-                axis(FuncFormatter(lambda value, _: f"{value:g}"))
+            lower.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            lower.yaxis.set_minor_formatter(FuncFormatter(_some))
         upper.legend()
     axes[0, 0].set_ylabel("return")
     axes[1, 0].set_ylabel("validation loss")

@@ -21,6 +21,7 @@ from matplotlib.axes import Axes
 
 from torchrl_l1.report.page import interval_text, markdown, number
 from torchrl_l1.report.published import published_cells
+from torchrl_l1.report.style import color as color_of
 
 HERE = Path(__file__).with_name("questions")
 # Reports of runs, the earliest first.
@@ -34,8 +35,8 @@ SCALES = {
     "walker": 800.0,
     "half_cheetah": 3270.0,
 }
-# Controllers in training: colour, and place beside the line of a cell.
-ARMS = {"paper": ("tab:orange", -0.16), "robust": ("tab:blue", 0.16)}
+# Controllers in training: place beside the line of a cell.
+ARMS = {"paper": -0.16, "robust": 0.16}
 ENDS = ("difference_low", "difference_high")
 Row = dict[str, str]
 
@@ -95,10 +96,13 @@ def ours(task: str, noise: str, l1: str) -> Found | None:
 
 
 def draw(ax: Axes, pair: Row, row: float, scale: float, color: str) -> None:
-    """A controller's differences in a cell: each seed, mean and interval."""
+    """A controller's differences in a cell: each seed, mean (hollow of a single one), interval."""
     differences = np.array(pair["differences"].split(), dtype=np.float64) / scale
-    ax.plot(differences, np.full_like(differences, row), "|", color=color, markersize=7)
-    ax.plot(float(pair["difference_mean"]) / scale, row, "D", color=color, markersize=4)
+    if len(differences) > 1:
+        ax.plot(differences, np.full_like(differences, row), "|", color=color, markersize=7)
+    face = color if len(differences) > 1 else "white"
+    mean = float(pair["difference_mean"]) / scale
+    ax.plot(mean, row, "D", color=color, markersize=4, markerfacecolor=face)
     if pair.get("difference_low"):
         ends = np.array([float(pair[name]) for name in ENDS])
         ax.plot(ends / scale, [row, row], color=color, lw=1)
@@ -134,13 +138,13 @@ def table1() -> None:
     cells = [(task, noise) for task in SCALES for noise in NOISES]
     for place, (task, noise) in enumerate(cells):
         run, scale = False, SCALES[task]
-        for l1, (color, offset) in ARMS.items():
+        for l1, offset in ARMS.items():
             found = ours(task, noise, l1)
             lines.append(line(task, noise, l1, found))
             if theirs := lines[-1]["its difference"]:
                 ax.plot(float(theirs) / scale, place, "o", color="0.6")
             if found is not None and found.pair is not None:
-                draw(ax, found.pair, place + offset, scale, color)
+                draw(ax, found.pair, place + offset, scale, color_of(0, l1))
                 run = True
         labels.append(f"{task.replace('_', ' ')}, {noise}" + ("" if run else " (not run)"))
     ax.axvline(0, color="0.8", zorder=0)
@@ -148,8 +152,11 @@ def table1() -> None:
     ax.set_yticks(range(len(cells)), labels)
     ax.set_xlabel("return with L1 in training less that without, as a share of the task's scale")
     ax.plot([], [], "o", color="0.6", label="published")
-    for l1, (color, _) in ARMS.items():
-        ax.plot([], [], "D-", color=color, markersize=4, label=f"ours, {l1}: mean, interval, seeds")
+    for l1 in ARMS:
+        label = f"ours, {l1}: mean, interval, seeds"
+        ax.plot([], [], "D-", color=color_of(0, l1), markersize=4, label=label)
+    single = {"color": "0.3", "markersize": 4, "markerfacecolor": "white"}
+    ax.plot([], [], "D", **single, label="hollow: a single seed")
     ax.legend(loc="lower right")
     figure.savefig(HERE / "table1.png", dpi=110)
     plt.close(figure)
@@ -170,13 +177,13 @@ def recovered() -> None:
     ]
     (HERE / "recovered.md").write_text(markdown(table) + "\n")
     figure, ax = plt.subplots(figsize=(7.5, 3.2), layout="constrained")
-    for offset, (l1, color) in enumerate((("paper", "tab:orange"), ("robust", "tab:blue"))):
+    for offset, l1 in enumerate(("paper", "robust")):
         for column, of in enumerate(lines.values()):
             mean, ends = of[l1].split(" ", 1)
             low, high = (float(end) for end in ends.strip("[]").split(", "))
             place = column + 0.36 * (offset - 0.5)
             label = f"L1 {l1}" if not column else None
-            ax.bar(place, float(mean), 0.34, color=color, alpha=0.75, label=label)
+            ax.bar(place, float(mean), 0.34, color=color_of(0, l1), alpha=0.75, label=label)
             ax.plot([place, place], [low, high], color="0.2", lw=1.2)
     ax.axhline(0, color="0.5", lw=0.8)
     ax.axhline(1, color="0.5", lw=0.8, ls="--")

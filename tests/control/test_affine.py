@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_l1.control import ActionJacobian, L1Config, affinize, augment, init, switching_law
+from torchrl_l1.control import (
+    ActionJacobian,
+    L1Config,
+    L1State,
+    affinize,
+    augment,
+    init,
+    switching_law,
+)
 from torchrl_l1.dynamics import EnsembleDynamics
 
 
@@ -291,3 +299,27 @@ def test_an_ensemble_is_evaluated_once_and_as_any_other_model(on_switch, switch_
             torch.testing.assert_close(found, expected, atol=1e-11, rtol=1e-9)
         states = [state for _, state, _ in results]
     assert 0 < states[0].n_switch.sum() < 150
+
+
+@pytest.mark.parametrize("kind", ["function", "analytic"])
+@pytest.mark.parametrize("make", [L1Config.paper, L1Config.reference, L1Config.robust])
+def test_one_step_of_each_environment_under_vmap(make, kind):
+    torch.manual_seed(0)
+    ensemble = EnsembleDynamics(3, 2, members=2, hidden=(8,))
+    effect = torch.randn(2, 3)
+    model = ActionJacobian(ensemble if kind == "analytic" else lambda x, u: u.sin() @ effect)
+    config = make(0.05)
+    state = init([5], 3, 2, config)
+
+    def one(*entries):
+        *remembered, x, u_rl = entries
+        before = L1State(**dict(zip(state.entries(), remembered, strict=True)))
+        u, following, _ = augment(config, model, before, x, u_rl)
+        return u, *following.entries().values()
+
+    for _ in range(3):
+        x, u_rl = torch.randn(5, 3), torch.randn(5, 2)
+        found = torch.func.vmap(one)(*state.entries().values(), x, u_rl)
+        u, state, _ = augment(config, model, state, x, u_rl)
+        for mapped, batched in zip(found, (u, *state.entries().values()), strict=True):
+            torch.testing.assert_close(mapped, batched)

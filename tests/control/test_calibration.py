@@ -109,3 +109,12 @@ def test_candidates_do_not_mix():
 def test_what_cannot_be_calibrated_is_refused(residual, jacobian, words):
     with pytest.raises(ValueError, match=words):
         calibrate(L1Config.robust(0.02), residual, jacobian, torch.eye(1))
+
+
+@pytest.mark.parametrize(
+    "covariance", [torch.zeros(2, 2), torch.diag(torch.tensor([1.0, 0.0])), torch.ones(2)]
+)
+def test_a_covariance_that_is_none_is_refused(covariance):
+    residual, jacobian = torch.ones(2, 30, 2), torch.ones(2, 30, 2, 1)
+    with pytest.raises(ValueError, match=r"positive definite covariance of the shape \(2, 2\)"):
+        calibrate(L1Config.robust(0.02, **BOUNDS), residual, jacobian, covariance)

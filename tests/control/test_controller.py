@@ -31,6 +31,7 @@ from torchrl.objectives import ClipPPOLoss, SACLoss
 
 from torchrl_l1.control import ActionJacobian, L1Config, L1Controller, L1Transform, init, step
 from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.envs import BatchedMujocoEnv
 
 CONFIG = L1Config(0.04, epsilon=0.02, action_low=-3.0, action_high=3.0)
 
@@ -69,6 +70,29 @@ def test_controller_and_transform_give_the_same_trajectory(config):
             outside["next", "l1", name], inside["next", "l1", name], atol=0, rtol=0
         )
     assert (outside["action"] != outside["l1", "u_rl"]).any()
+
+
+@pytest.mark.parametrize("has_weights", [False, True])
+def test_types_are_those_of_the_transform(has_weights):
+    def change(observation, action):
+        effect = torch.tensor([[0.0, 0.1, 0.2, 0.3]], dtype=torch.float64)
+        return 0.1 * observation + action.sin() @ effect
+
+    model = make_model() if has_weights else change
+    controller = L1Controller(model, CONFIG, observation_dim=4, action_dim=1)
+    actor = TensorDictModule(lambda x: x[..., :1] - x[..., 1:2], ["observation"], ["action"])
+
+    def environment(transform):
+        base = BatchedMujocoEnv("inverted_pendulum", 2, seed=0, dtype=torch.float64)
+        return TransformedEnv(base, transform)
+
+    env = environment(controller.make_primer())
+    outside = env.rollout(5, TensorDictSequential(actor, controller))
+    inside = environment(L1Transform(model, CONFIG)).rollout(5, actor)
+    assert torch.equal(outside["action"], inside["next", "l1", "u_exec"])
+    for where in ("l1", ("next", "l1")):
+        for name, spec in env.observation_spec["l1"].items():
+            assert spec.dtype == outside[where][name].dtype == inside[where][name].dtype
 
 
 def test_state_restarts_with_its_environment():

@@ -393,3 +393,18 @@ def test_actuators_that_push_too_little_at_both_bounds_do_not_mislead(law, first
         x = x + (jacobian @ force.unsqueeze(-1)).squeeze(-1) + noise
     # The mean over both bounds is zero, the push of 0.3 or 0.4 at either is what may mislead.
     assert state.sigma_m.mean().abs() < 0.15
+
+
+@pytest.mark.parametrize("bound", [1e12, 3e38, float("inf")])
+def test_bounds_beyond_all_reach_are_none(bound):
+    def trajectory(**bounds):
+        config = L1Config.robust(0.05, **bounds)
+        state = init([1], 3, 1, config)
+        torch.manual_seed(0)
+        for _ in range(9):
+            x, u_rl = torch.randn(1, 3), torch.rand(1, 1)
+            u, state, diagnostics = augment(config, model_with_residuals(), state, x, u_rl)
+        assert not diagnostics.non_finite.any()
+        return u, state.sigma_m
+
+    torch.testing.assert_close(trajectory(action_low=-bound, action_high=bound), trajectory())

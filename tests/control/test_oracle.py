@@ -12,7 +12,15 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.envs import Compose, GymEnv, SerialEnv, Transform, TransformedEnv
+from torchrl.envs import (
+    ActionScaling,
+    Compose,
+    DoubleToFloat,
+    GymEnv,
+    SerialEnv,
+    Transform,
+    TransformedEnv,
+)
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_l1.control import OracleTransform
@@ -100,6 +108,31 @@ def test_nested_chains_are_searched_too() -> None:
     env, received = environment(Compose(shifted(0.5), Compose(scaled(2.0))), OracleTransform())
     stepped(env, 1.0)
     assert received.last.unique().tolist() == [1.0]
+
+
+def test_environments_inside_are_searched_too() -> None:
+    inner, received = environment(shifted(0.5))
+    middle = TransformedEnv(inner, scaled(2.0), auto_unwrap=False)
+    env = TransformedEnv(middle, OracleTransform(), auto_unwrap=False)
+    assert stepped(env, 1.0)["next", "l1", "u_exec"].unique().tolist() == [0.25]
+    assert received.last.unique().tolist() == [1.0]
+
+
+def test_other_units_between_a_disturbance_and_the_oracle_are_refused() -> None:
+    env, _ = environment(shifted(0.5), ActionScaling(), OracleTransform())
+    with pytest.raises(ValueError, match="ActionScaling stands between Disturbed and Oracle"):
+        env.reset()
+    inside = environment(shifted(0.5), ActionScaling())[0]
+    with pytest.raises(ValueError, match="put ActionScaling after OracleTransform"):
+        TransformedEnv(inside, OracleTransform(), auto_unwrap=False).reset()
+    # A change of type is none of units, and before the disturbance or after the oracle all is well.
+    double = BatchedMujocoEnv("inverted_pendulum", 3, seed=0, dtype=torch.float64)
+    cast = DoubleToFloat(in_keys=["observation"], in_keys_inv=["action"])
+    TransformedEnv(double, Compose(shifted(0.5), cast, OracleTransform())).reset()
+    env, received = environment(shifted(0.5), OracleTransform(), ActionScaling())
+    env.step(env.reset().set("action", torch.full((3, 1), 0.25)))
+    assert received.last.unique().tolist() == [0.75]
+    environment(ActionScaling(), shifted(0.5), OracleTransform())[0].reset()
 
 
 def test_episodes_of_a_cancelled_bias_are_those_without_it() -> None:

@@ -374,3 +374,54 @@ def test_observations_in_other_units_than_those_of_the_fit_are_noticed():
         first_step(10 * x)
     with pytest.warns(UserWarning, match="other units"):
         first_step(x[:1] - torch.tensor([4.0, 0.0, 0.0]))
+
+
+class WithCovariance:
+    """A linear model that says what it thinks of its residuals."""
+
+    def __init__(self, covariance):
+        self.covariance = covariance
+
+    def mean_change(self, observation, action):
+        return 0.1 * observation + 0.2 * action
+
+    def residual_covariance(self, observation, action):
+        return self.covariance(observation)
+
+
+ROBUST = L1Config.robust(0.05)
+WEIGHTED = L1Config(0.05, estimator="weighted")
+
+
+@pytest.mark.parametrize("config", [ROBUST, WEIGHTED])
+@pytest.mark.parametrize(
+    ("covariance", "error", "words"),
+    [
+        (lambda x: torch.diag(torch.tensor([1.0, 1.0, 0.0])), ValueError, "positive definite"),
+        (lambda x: torch.full((3, 3), torch.nan), ValueError, "not finite"),
+        (lambda x: torch.ones(3), ValueError, r"shape \(3,\), expected \(3, 3\) or \(5, 3, 3\)"),
+        (lambda x: torch.eye(3).double(), TypeError, "is torch.float64, expected a tensor of"),
+        (lambda x: 0.1, TypeError, "is float, expected a tensor"),
+    ],
+)
+def test_a_residual_covariance_that_is_none_is_named(config, covariance, error, words):
+    step = make_step(config, ActionJacobian(WithCovariance(covariance)), False)
+    x, u = torch.randn(5, 3), torch.randn(5, 3)
+    with pytest.raises(error, match=f"residual covariance of the model WithCovariance .*{words}"):
+        step(init([5], 3, 3, config), x, u)
+
+
+def test_a_residual_covariance_that_varies_needs_to_be_remembered():
+    def varying(x):
+        return torch.diag_embed(0.1 + x.square())
+
+    x, u = torch.randn(5, 3), torch.randn(5, 3)
+    model = ActionJacobian(WithCovariance(varying))
+    with pytest.warns(UserWarning, match="depends on the state.*give covariance='sum'"):
+        make_step(ROBUST, model, False)(init([5], 3, 3, ROBUST), x, u)
+    remembering = L1Config.robust(0.05, covariance="sum")
+    for config in (remembering, WEIGHTED):
+        step = make_step(config, ActionJacobian(WithCovariance(varying)), False)
+        step(init([5], 3, 3, config), x, u)
+    same = ActionJacobian(WithCovariance(lambda x: torch.eye(3).expand(*x.shape, 3)))
+    make_step(ROBUST, same, False)(init([5], 3, 3, ROBUST), x, u)

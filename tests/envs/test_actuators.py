@@ -13,16 +13,34 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, GymEnv, Transform, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    ConditionalSkip,
+    EnvBase,
+    FrameSkipTransform,
+    GymEnv,
+    MultiAction,
+    NoopResetEnv,
+    PendulumEnv,
+    SerialEnv,
+    Transform,
+    TransformedEnv,
+)
 from torchrl.envs.utils import check_env_specs
 
+from torchrl_l1.control import ActionJacobian, L1Transform, OracleTransform
 from torchrl_l1.envs import (
+    ActionNoise,
     ActuatorBias,
     ActuatorDelay,
     ActuatorGain,
+    BatchedMujocoEnv,
     DeadZone,
     FailingMotor,
+    ObservationNoise,
     RandomSigns,
+    SensorBias,
+    SensorDelay,
     SineBias,
     StepBias,
     Stiction,
@@ -227,6 +245,110 @@ def test_on_gymnasium_batched_and_not(transform: Transform):
     assert repr(again) == repr(transform)
 
 
+def test_environments_of_any_batch_have_values_of_their_own():
+    params = PendulumEnv.gen_params(batch_size=[64])
+    env = TransformedEnv(PendulumEnv(), ActuatorBias(RandomSigns(0.3)))
+    zero = env.reset(params, set_state=True).set("action", torch.zeros(64, 1))
+    speeds = env.step(zero)["next", "thdot"] - PendulumEnv().step(zero)["next", "thdot"]
+    assert (speeds > 0).any() and (speeds < 0).any()
+    rows = torch.linspace(-1, 1, 64).unsqueeze(-1)
+    env = TransformedEnv(PendulumEnv(), ActuatorBias(rows))
+    zero = env.reset(params, set_state=True).set("action", torch.zeros(64, 1))
+    speeds = env.step(zero)["next", "thdot"]
+    same = PendulumEnv().step(zero.set("action", rows))["next", "thdot"]
+    torch.testing.assert_close(speeds, same)
+
+
+STEPPING = {
+    "frames": lambda: FrameSkipTransform(3),
+    "chunks": MultiAction,
+    "noops": lambda: NoopResetEnv(2),
+}
+ALWAYS, IN_FRAMES, NEVER = {"frames", "chunks", "noops"}, {"frames"}, set()
+
+
+@pytest.mark.parametrize(
+    ("make", "refused"),
+    [
+        (lambda: ActuatorBias(0.1), IN_FRAMES),
+        (lambda: ActuatorBias(RandomSigns(0.1)), ALWAYS),
+        (lambda: ActuatorDelay(1), ALWAYS),
+        (lambda: ActionNoise(0.1), IN_FRAMES),
+        (lambda: SensorDelay(1), ALWAYS),
+        (lambda: SensorBias(0.1), NEVER),
+        (lambda: ObservationNoise(0.1), NEVER),
+    ],
+)
+@pytest.mark.parametrize("kind", STEPPING)
+def test_what_steps_the_environment_itself_comes_before_or_around(make, refused, kind):
+    def chain(*transforms):
+        return TransformedEnv(Echo((1,)), Compose(*transforms))
+
+    later = STEPPING[kind]()
+    name = type(later).__name__
+    if kind in refused:
+        with pytest.raises(ValueError, match=f"{name} comes after {type(make()).__name__} and"):
+            chain(make(), later).reset()
+        appended = chain(make())
+        appended.reset()
+        appended.append_transform(STEPPING[kind]())
+        with pytest.raises(ValueError, match=f"put {name} before"):
+            appended.reset()
+    else:
+        chain(make(), later).reset()
+    chain(STEPPING[kind](), make()).reset()
+    TransformedEnv(chain(make()), STEPPING[kind](), auto_unwrap=False).reset()
+
+
+@pytest.mark.parametrize("make", [lambda: ActuatorBias(0.1), lambda: ActionNoise(0.1)])
+@pytest.mark.parametrize("auto_unwrap", [False, True])
+def test_a_controller_inside_is_refused(make, auto_unwrap):
+    inside = TransformedEnv(BatchedMujocoEnv("inverted_pendulum", 2), OracleTransform())
+    outside = TransformedEnv(inside, make(), auto_unwrap=auto_unwrap)
+    with pytest.raises(ValueError, match=r"comes after OracleTransform, so that .*: put A"):
+        outside.reset()
+    model = ActionJacobian(lambda x, u: x + u)
+    inside = TransformedEnv(BatchedMujocoEnv("inverted_pendulum", 2), L1Transform(model))
+    with pytest.raises(ValueError, match="comes after L1Transform"):
+        TransformedEnv(inside, make(), auto_unwrap=auto_unwrap).reset()
+    TransformedEnv(inside, ObservationNoise(0.0), auto_unwrap=False).reset()
+    many = SerialEnv(2, lambda: TransformedEnv(Echo((1,)), OracleTransform()))
+    with pytest.raises(ValueError, match="comes after OracleTransform"):
+        TransformedEnv(many, make()).reset()
+
+
+@pytest.mark.parametrize("rows", [[True, False], [False, False]])
+def test_a_step_that_is_skipped_changes_no_state(rows):
+    stepped = torch.tensor(rows).unsqueeze(-1)
+    never = torch.zeros_like(stepped)
+    for order in (1, -1):
+        decisions = iter([never, ~stepped, never, never])
+        skip = ConditionalSkip(lambda _, decisions=decisions: next(decisions))
+        env = TransformedEnv(Echo((2,), 1), Compose(*[skip, ActuatorDelay(1)][::order]))
+        state, received = env.reset(), []
+        for sent in (0.1, 0.2, 0.3, 0.4):
+            data = env.step(state.set("action", torch.full((2, 1), sent).double()))
+            received.append(data["next", "observation"][:, 0])
+            state = env.step_mdp(data)
+        expected = [0.2 if row else 0.1 for row in rows]
+        assert received[2].tolist() == pytest.approx(expected)
+        assert received[3].tolist() == pytest.approx([0.3, 0.3])
+
+
+def test_frames_around_a_disturbance_are_disturbed_once_each():
+    class Sums(Echo):
+        def _step(self, tensordict: TensorDict) -> TensorDict:
+            received.append(tensordict["action"].flatten().tolist())
+            return super()._step(tensordict)
+
+    received: list[list[float]] = []
+    inner = TransformedEnv(Sums((1,)), Compose(ActuatorDelay(1), ActuatorBias(0.5)))
+    env = TransformedEnv(inner, FrameSkipTransform(3), auto_unwrap=False)
+    env.reset()
+    send(env, torch.full((1, 2), 0.25).double())
+    assert received == [[0.0, 0.0], [0.75, 0.75], [0.75, 0.75]]
+
+
 def test_copies_have_a_state_of_their_own():
     env = TransformedEnv(Echo(), WalkBias(0.1))
     env.reset()
@@ -234,6 +356,19 @@ def test_copies_have_a_state_of_their_own():
     twin = copy.deepcopy(env)
     send(twin, zero)
     assert (send(env, zero) == 0).all() and (send(twin, zero) != 0).all()
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda shape: torch.tensor(0.3),
+        lambda shape: torch.rand(shape[:-1]),
+        lambda shape: torch.full(shape, torch.nan),
+    ],
+)
+def test_draws_that_fit_no_environment_are_refused(draw):
+    with pytest.raises(ValueError, match="ActuatorBias drew values of shape"):
+        TransformedEnv(Echo((2,), 2), ActuatorBias(draw)).reset()
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.wrappers import TimeLimit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torchrl.envs import GymEnv, StepCounter, TransformedEnv
@@ -138,6 +139,17 @@ def test_others_go_on_when_one_is_reset():
     assert same.tolist() == [True, False, True]
 
 
+def test_environments_that_a_mask_leaves_out_stay_as_they_are():
+    env = task_of(Cart).environment(2, seed=0)
+    data = env.rand_step(env.reset())
+    masked = env.step_mdp(data).set("_step", torch.tensor([[True], [False]]))
+    stayed = env.step(masked.set("action", torch.tensor([[0.5], [torch.nan]])))["next"]
+    assert [cell.env.unwrapped.steps for cell in env.cells] == [2, 1]
+    assert torch.equal(stayed["observation"][1], data["next", "observation"][1])
+    assert stayed["reward"][1] == 0 and stayed["reward"][0] != 0
+    assert env._steps.tolist() == [2, 1]
+
+
 def test_steps_that_are_not_finite_end_the_episode_and_are_told():
     env = task_of(lambda: Cart(bad_after=3)).environment(2, seed=0)
     data = env.rollout(10)
@@ -199,6 +211,15 @@ def test_what_an_environment_does_not_tell_is_asked_for():
         get_task("gymnasium/Pendulum-v1", dt=0.1)
     with pytest.raises(ValueError, match="leave dt out"):
         get_task("half_cheetah", dt=1.0)
+
+
+def test_of_several_time_limits_the_shortest_counts():
+    for limits in ((200, 300), (300, 200)):
+
+        def make(limits=limits):
+            return TimeLimit(TimeLimit(Cart(), limits[0]), limits[1])
+
+        assert ExternalTask(environment_source(make)).horizon == 200
 
 
 def test_own_tasks_stay_what_they_are():

@@ -9,6 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torchrl.envs import MultiAction, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_l1.envs import TASKS, BatchedMujocoEnv, BatchedSimulator
@@ -71,6 +72,45 @@ def test_partial_reset(mask, steps):
         assert torch.equal(ours["observation"][kept], theirs["observation"][kept])
         assert ours["truncated"].squeeze(-1)[kept].tolist() == [count == 10] * int(kept.sum())
         assert not ours["truncated"].squeeze(-1)[chosen].any()
+
+
+@given(mask=st.lists(st.booleans(), min_size=3, max_size=3))
+@settings(max_examples=6, deadline=None)
+def test_environments_that_a_mask_leaves_out_stay_as_they_are(mask):
+    env = BatchedMujocoEnv("swimmer", 3, seed=0, max_steps=5, dtype=torch.float64)
+    twin = BatchedMujocoEnv("swimmer", 3, seed=0, max_steps=5, dtype=torch.float64)
+    chosen = torch.tensor(mask)
+    actions = torch.rand(5, 3, 2, dtype=torch.float64) * 2 - 1
+    for each in (env, twin):
+        before = each.step(each.reset().set("action", actions[0]))
+    masked = env.step_mdp(before).set("_step", chosen.unsqueeze(-1))
+    masked["action"] = actions[1].masked_fill(~chosen.unsqueeze(-1), torch.nan)
+    stayed, went = env.step(masked)["next"], _step(twin, actions[1])
+    assert torch.equal(stayed["observation"][chosen], went["observation"][chosen])
+    assert torch.equal(stayed["observation"][~chosen], before["next", "observation"][~chosen])
+    assert (stayed["reward"][~chosen] == 0).all()
+    # Those left out take their second step now, the others their third.
+    following = _step(env, actions[1])["observation"]
+    assert torch.equal(following[~chosen], went["observation"][~chosen])
+    assert env._steps.tolist() == [2 + one for one in mask]
+
+
+def test_a_chunk_of_actions_ends_where_an_episode_does():
+    chunks = TransformedEnv(BatchedMujocoEnv("walker", 2, seed=0), MultiAction())
+    single = BatchedMujocoEnv("walker", 2, seed=0)
+    actions = torch.stack([torch.zeros(150, 6), torch.full((150, 6), 1.0)])
+    state = chunks.reset().set("action", actions)
+    chunked = chunks.step(state)["next"]
+    single.reset()
+    ends, earned = [], torch.zeros(2)
+    over = torch.zeros(2, 1, dtype=torch.bool)
+    for action in actions.unbind(1):
+        data = _step(single, action)
+        earned += data["reward"].masked_fill(over, 0.0).squeeze(-1)
+        over |= data["terminated"]
+        ends.append(over.squeeze(-1).tolist())
+    assert [False, True] in ends or [True, False] in ends
+    torch.testing.assert_close(chunked["reward"].sum((1, 2)), earned)
 
 
 def test_seeds():
@@ -158,8 +198,8 @@ def test_a_bad_state_after_the_last_substep_is_noticed():
         def __getattr__(self, name):
             return getattr(batch, name)
 
-        def step(self, nstep):
-            batch.step(nstep=nstep)
+        def step(self, ids, nstep):
+            batch.step(ids, nstep=nstep)
             batch.qvel[1, 0] = np.nan
 
     env._simulation.simulator.batch = LastSubstepBreaks()

@@ -9,10 +9,17 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, GymEnv, TransformedEnv
+from torchrl.envs import Compose, EnvBase, GymEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_l1.envs import RandomSigns, SensorBias, SensorDelay, SensorDropout
+from torchrl_l1.envs import (
+    BatchedMujocoEnv,
+    ObservationNoise,
+    RandomSigns,
+    SensorBias,
+    SensorDelay,
+    SensorDropout,
+)
 
 
 class Counter(EnvBase):
@@ -146,3 +153,18 @@ def test_environments_that_reset_themselves_are_disturbed_once():
     state = TensorDict({"observation": fresh}, batch_size=[3])
     after = env.transform._reset_on_native_autoreset(mask, state)["observation"]
     assert after[:, 0].tolist() == [0.5, 1.5, 1.5]
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: SensorBias(0.5), lambda: SensorDelay(2), lambda: ObservationNoise(0.1)]
+)
+def test_environments_that_a_mask_leaves_out_see_what_they_saw(make):
+    base = BatchedMujocoEnv("hopper", 3, seed=0)
+    env = TransformedEnv(base, Compose(make(), SensorDropout(0.5)))
+    torch.manual_seed(0)
+    state = env.rand_step(env.reset())
+    state = env.rand_step(env.step_mdp(state))
+    masked = env.step_mdp(state).set("_step", torch.tensor([[True], [False], [True]]))
+    seen = env.step(masked.set("action", env.action_spec.zero()))["next", "observation"]
+    same = (seen == state["next", "observation"]).all(-1)
+    assert same.tolist() == [False, True, False]

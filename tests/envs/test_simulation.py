@@ -259,8 +259,8 @@ def test_a_bad_simulation_repeats_the_whole_observation():
         def __getattr__(self, name):
             return getattr(batch, name)
 
-        def step(self, nstep):
-            batch.step(nstep=nstep)
+        def step(self, ids, nstep):
+            batch.step(ids, nstep=nstep)
             batch.qvel[1, 0] = np.nan
 
     env._simulation.simulator.batch = Breaks()

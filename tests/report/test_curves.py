@@ -75,3 +75,20 @@ def test_a_run_that_has_just_begun_changes_no_axis(
     assert axis.get_xscale() == scale
     labels = [text.get_text() for minor in (False, True) for text in axis.get_xticklabels(minor)]
     assert any(labels) and not any("$" in label for label in labels)
+
+
+def test_a_line_without_a_finished_run_is_in_the_legend(
+    write_run: WriteRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_run([-3.0] * 2, "l1=off", iterations=20)
+    write_run([-3.0] * 20, "l1=paper")
+    figures: list[Figure] = []
+    monkeypatch.setattr(curves, "save", lambda figure, _: figures.append(figure))
+    curves.plot_panels([Panel("", lines_of(tmp_path))], tmp_path / "curves.png")
+    (legend,) = figures[0].legends
+    entries = {
+        text.get_text(): handle.get_color()
+        for text, handle in zip(legend.get_texts(), legend.legend_handles, strict=True)
+    }
+    assert {"L1 off", "L1 paper", "unfinished run"} <= set(entries)
+    assert entries["L1 off"] != entries["L1 paper"]

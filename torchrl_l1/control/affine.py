@@ -15,7 +15,7 @@ from torchrl_l1.compilation import CompileMode, compiled
 from torchrl_l1.control import kalman_law, law
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import ActionJacobian
-from torchrl_l1.control.probe import FORWARD_MODE
+from torchrl_l1.control.probe import FORWARD_MODE, probe_covariance
 from torchrl_l1.control.signals import (
     ControlInput,
     diagnose,
@@ -327,6 +327,15 @@ def _prepared(
         return step(state, observation, u_rl)
     with FORWARD_MODE:  # where the step is compiled, torch differentiates while it traces
         model.prepare(observation, saturate(config, u_rl))
+        if config.filter == "kalman" or config.estimator == "weighted":
+            probe_covariance(
+                model.dynamics,
+                lambda x, u: model.residual_statistics(x, u, config.covariance).covariance,
+                observation,
+                saturate(config, u_rl),
+                is_whole=config.estimator == "weighted",
+                is_late=config.filter == "kalman" and config.covariance == "residuals",
+            )
         return step(state, observation, u_rl)
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrl_l1.control import kalman, kalman_law
 from torchrl_l1.control.config import L1Config
+from torchrl_l1.control.probe import is_positive
 from torchrl_l1.control.signals import saturate
 from torchrl_l1.control.state import L1State, ResidualStatistics, init
 
@@ -81,8 +82,8 @@ def calibrate(
         the two numbers and what they were chosen by.
 
     Raises:
-        ValueError: if there are fewer than 20 steps in the episodes, entries are not finite, or the
-            settings have no Kalman filter.
+        ValueError: if there are fewer than 20 steps in the episodes, entries are not finite, the
+            covariance is not positive definite, or the settings have no Kalman filter.
 
     Examples:
         >>> generator = torch.Generator().manual_seed(0)
@@ -113,6 +114,13 @@ def calibrate(
     if not all(values.isfinite().all() for values in (residual, jacobian, action)):
         raise ValueError(
             "calibration needs finite residuals, Jacobians and actions: leave the others out"
+        )
+    covariance = covariance.to(residual)
+    is_whole = config.estimator == "weighted"
+    if covariance.shape != (n, n) or not is_positive(covariance, is_whole):
+        raise ValueError(
+            f"calibration needs a positive definite covariance of the shape {(n, n)}, got "
+            f"{tuple(covariance.shape)}: give states without residuals a small variance"
         )
     if generator is None:
         generator = torch.Generator().manual_seed(0)

@@ -27,6 +27,8 @@ _NUMBERS = (
 DEFAULT_ALPHA = 0.35
 """Filter gain per step when neither ``alpha`` nor ``cutoff`` is given: cutoff = 0.35 / dt."""
 
+_LARGEST_RANGE = 1e9
+
 _CHOICES = {
     "on_switch": get_args(OnSwitch),
     "switch_on": get_args(SwitchOn),
@@ -42,7 +44,8 @@ class L1Config:
     r"""Settings of the L1 adaptive controller (arXiv 2403.14860, sections 3.1 and 3.2).
 
     The defaults are those of the paper's Algorithms 1 and 2; :meth:`reference` gives the
-    settings of the authors' released controller.
+    settings of the authors' released controller, and :meth:`robust` those of the controller
+    that weighs what the model misses by its covariance and acts on what is significant.
 
     Args:
         dt: sampling time :math:`T_s`: the time of one environment step, in seconds.
@@ -82,8 +85,9 @@ class L1Config:
         dead_zone: posterior standard deviations of the disturbance within which the Kalman
             filter's estimate is not acted on; 0 acts on all of it.
         process_noise: standard deviation of the disturbance's change per step, as a fraction
-            of half the range of the action (of one action unit without bounds). If ``None``, what
-            the model says of itself, see :func:`~torchrl_l1.control.calibrate`, or else 0.01.
+            of half the range of the action (of one action unit without bounds, or with a range
+            beyond 1e9). If ``None``, what the model says of itself, see
+            :func:`~torchrl_l1.control.calibrate`, or else 0.01.
         inflation: factor on the covariance, since residuals are neither white nor normal. If
             ``None``, what the model says of itself, or else 1.
         initial_deviation: standard deviation of the disturbance at a reset, in the units of
@@ -269,11 +273,14 @@ class L1Config:
 
     @property
     def half_range(self) -> Scalars:
-        """Half the range of the action, one where a bound is missing; action units."""
+        """Half the range of the action, one where a bound is missing or none; action units.
+
+        Beyond 1e9 it is none: some environments write the largest number for infinity.
+        """
         if self.action_low is None or self.action_high is None:
             return 1.0
         pairs = zip(_tuple(self.action_low), _tuple(self.action_high), strict=True)
-        halves = tuple(0.5 * (b - a) if math.isfinite(b - a) else 1.0 for a, b in pairs)
+        halves = tuple(0.5 * (b - a) if b - a < _LARGEST_RANGE else 1.0 for a, b in pairs)
         return halves if isinstance(self.action_low, tuple) else halves[0]
 
     @property

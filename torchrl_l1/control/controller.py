@@ -107,10 +107,12 @@ class L1Primer(TensorDictPrimer):
         key: str,
         diagnostics: bool,
         check_dt: bool,
+        has_dtype: bool,
     ) -> None:
         config = environment.settings.config
         super().__init__(Composite({key: layout.state_spec(config)}), expand_specs=True)
         self._shared = environment
+        self._layout, self._diagnostics, self._has_dtype = layout, diagnostics, has_dtype
         self._signals = layout.signal_spec(diagnostics)
         self.observation_key = unravel_key(observation_key)
         self.action_key = unravel_key(action_key)
@@ -132,8 +134,31 @@ class L1Primer(TensorDictPrimer):
         names = (*self._state_names, SEAL, "u_exec", *L1Diagnostics._fields)
         widen_selection(self, self.key, names)
 
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Add the controller's state."""
+        self._adopt_types()
+        return super().transform_input_spec(input_spec)
+
+    def _adopt_types(self) -> None:
+        """Those of the environment: of its action and, for a model without any, observation."""
+        parent, layout = self.parent, self._layout
+        if parent is None:
+            return
+        types = {"action_dtype": parent.full_action_spec.get(self.action_key, None)}
+        if not self._has_dtype:
+            types["dtype"] = parent.full_observation_spec.get(self.observation_key, None)
+        found = {name: spec.dtype for name, spec in types.items() if spec is not None}
+        floating = {name: dtype for name, dtype in found.items() if dtype.is_floating_point}
+        self._layout = replace(layout, **floating)
+        if self._layout != layout:
+            primers = Composite({self.key: self._layout.state_spec(self._shared.settings.config)})
+            device: torch.device | None = self.device
+            self.primers: Composite = primers if device is None else primers.to(device)
+            self._signals = self._layout.signal_spec(self._diagnostics)
+
     def transform_output_spec(self, output_spec: Composite) -> Composite:
         """Add the controller's state and signals."""
+        self._adopt_types()
         output_spec = super().transform_output_spec(output_spec)
         observation_spec = output_spec["full_observation_spec"]
         signals = self._signals.expand(observation_spec.shape).to(observation_spec.device)
@@ -354,10 +379,12 @@ class L1Controller(TensorDictModuleBase):
                 "tell: give L1Controller observation_dim and action_dim"
             )
         self._environment.config.check_dimensions(observation_dim, action_dim)
-        dtype = self.model.dtype or torch.get_default_dtype()
+        known = self.model.dtype
+        dtype = known or torch.get_default_dtype()
         layout = Layout(torch.Size([]), observation_dim, action_dim, dtype, dtype)
         keys = self.observation_key, self.action_key, self.key
-        return L1Primer(self._environment, layout, *keys, self.diagnostics, self.check_dt)
+        settings = self.diagnostics, self.check_dt, known is not None
+        return L1Primer(self._environment, layout, *keys, *settings)
 
     # The name under which torchrl.modules.utils.get_primers_from_module looks for it.
     make_tensordict_primer = make_primer

@@ -357,11 +357,13 @@ class ActionJacobian:
         basis = torch.eye(action.shape[-1], dtype=action.dtype, device=action.device)
         # The value does not depend on the tangent: it comes out once, without a new dimension. Nor
         # does the tangent's image where the action has no effect, which torch cannot put last.
-        out_dims: Any = (None, 0)
+        # Within a transform of the caller's, torch takes its dimension for one of the tangent's.
+        is_inner = _is_traced() and not torch.compiler.is_compiling()
+        out_dims: Any = (0 if is_inner else None, 0)
         value, jacobian = _pushed_forward(
             lambda: torch.func.vmap(push_forward, out_dims=out_dims)(basis)
         )
-        return value, jacobian.movedim(0, -1)
+        return value[0] if is_inner else value, jacobian.movedim(0, -1)
 
     def _reverse_mode(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Value and Jacobian, one backward pass per state; the rows of a batch are independent."""

@@ -9,8 +9,14 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
-from torchrl.envs import EnvBase
-from torchrl.envs.transforms import Transform
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.transforms import (
+    ActionScaling,
+    Compose,
+    DeviceCastTransform,
+    DTypeCastTransform,
+    Transform,
+)
 
 from torchrl_l1.control.layout import L1_KEY, required_entry
 
@@ -21,9 +27,10 @@ _PENDING = "_oracle_pending"
 class OracleTransform(Transform):
     r"""A clairvoyant in the place of :class:`~torchrl_l1.control.L1Transform`.
 
-    It looks up the matched disturbances that stand before it in ``Compose`` and sends what they
-    turn back into the policy's action: the policy's action less the matched disturbance, clipped
-    once, at the end, to what the actuators can do. With disturbances
+    It looks up the matched disturbances that stand before it in ``Compose``, or in a transformed
+    environment inside, and sends what they turn back into the policy's action: the policy's action
+    less the matched disturbance, clipped once, at the end, to what the actuators can do. With
+    disturbances
     :math:`d_1, \dots, d_k` in the order of ``Compose``, an input :math:`u` reaches the plant as
     :math:`d_1(\dots d_k(u))`, and the oracle sends
 
@@ -47,6 +54,8 @@ class OracleTransform(Transform):
         key: name of the nested tensordict with the executed input.
 
     Raises:
+        ValueError: at a reset, if a transform that maps actions to other units stands between a
+            disturbance and the oracle.
         KeyError: at a step, if there is no action.
         RuntimeError: if used in a replay buffer.
 
@@ -106,6 +115,7 @@ class OracleTransform(Transform):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         # Partial resets are merged by the environment, which discards the rows not reset.
+        list(self._compensations())
         action = self._action_spec()
         extra = tensordict_reset.batch_size[: tensordict_reset.ndim - action.ndim + 1]
         nothing = torch.zeros(*extra, *action.shape, dtype=action.dtype, device=action.device)
@@ -113,7 +123,10 @@ class OracleTransform(Transform):
 
     def _action_spec(self) -> TensorSpec:
         # That of the actuators, whatever transforms make of it on the way to the policy.
-        return self._environment().base_env.full_action_spec[self.action_key]
+        environment = self._environment()
+        while isinstance(environment, TransformedEnv):
+            environment = environment.base_env
+        return environment.full_action_spec[self.action_key]
 
     def _environment(self) -> EnvBase:
         try:
@@ -135,14 +148,32 @@ class OracleTransform(Transform):
         """Those of the disturbances before this one, in the order in which they are undone.
 
         An action meets the last transform first and the plant last: what the plant is to receive
-        is traced back from the first transform.
+        is traced back from the first transform, of the innermost environment.
         """
-        for transform in self._environment().transform.modules():
+        chains, environment = [], self._environment()
+        while isinstance(environment, TransformedEnv):
+            chains.append(environment.transform)
+            environment = environment.base_env
+        undone = ""
+        for transform in (member for chain in reversed(chains) for member in chain.modules()):
             if transform is self:
                 return
             compensate = getattr(transform, "compensate", None)
             if compensate is not None:
+                undone = type(transform).__name__
                 yield compensate
+            elif undone and self._changes_units(transform):
+                name = type(transform).__name__
+                raise ValueError(
+                    f"{name} stands between {undone} and OracleTransform, which would undo the one "
+                    f"in the units of the other: put {name} after OracleTransform"
+                )
+
+    def _changes_units(self, transform: object) -> bool:
+        if isinstance(transform, (Compose, DTypeCastTransform, DeviceCastTransform)):
+            return False
+        keys = getattr(transform, "in_keys_inv", None) or ()
+        return isinstance(transform, ActionScaling) or self.action_key in map(unravel_key, keys)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(key={self.key!r})"

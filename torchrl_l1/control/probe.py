@@ -93,6 +93,65 @@ def probe(
         return _choose_mode(dynamics, change, jacobians, observation, action, value)
 
 
+def probe_covariance(
+    dynamics: object,
+    covariance_of: ChangeFunction,
+    observation: Tensor,
+    action: Tensor,
+    *,
+    is_whole: bool = True,
+    is_late: bool = False,
+) -> None:
+    """Look at the covariance of a model's residuals on the data of a first step.
+
+    Args:
+        dynamics: the model, to be named in errors.
+        covariance_of: of observation and action: ``(n, n)``, or ``(..., n, n)``.
+        observation: ``(..., n)``.
+        action: ``(..., m)``.
+        is_whole: whether residuals are whitened with it, and not only with its diagonal's mean.
+        is_late: whether it is asked for at the step after that of the residual.
+
+    Raises:
+        TypeError: if it is no tensor of the observation's type.
+        ValueError: if its shape is wrong, or it is not positive definite.
+    """
+    observation, action = _moderate(observation), _moderate(action)
+    name, n = f"the residual covariance of {describe(dynamics)}", observation.shape[-1]
+    with torch.no_grad():
+        found = covariance_of(observation, action)
+        if not isinstance(found, Tensor) or found.dtype != observation.dtype:
+            kind = found.dtype if isinstance(found, Tensor) else type(found).__name__
+            raise TypeError(f"{name} is {kind}, expected a tensor of {observation.dtype}")
+        if found.shape not in ((n, n), (*observation.shape, n)):
+            raise ValueError(
+                f"{name} has shape {tuple(found.shape)}, expected {(n, n)} or "
+                f"{(*observation.shape, n)}"
+            )
+        if not is_positive(found, is_whole):
+            raise ValueError(
+                f"{name} is not finite and positive definite: give states that it never misses a "
+                "small variance"
+            )
+        if is_late and found.ndim > 2:
+            other = covariance_of(1.0 - 2.0 * observation, 1.0 - 2.0 * action)
+            if not torch.allclose(found, other):
+                warnings.warn(
+                    f"{name} depends on the state, which covariance='residuals' does not expect: "
+                    "give covariance='sum', with which each step remembers that of the last",
+                    stacklevel=2,
+                )
+
+
+def is_positive(covariance: Tensor, is_whole: bool = True) -> bool:
+    """Whether covariances ``(..., n, n)`` are positive definite, or else their diagonal's mean."""
+    covariance = covariance.to(torch.promote_types(covariance.dtype, torch.float32))
+    if not is_whole:
+        return bool((covariance.diagonal(dim1=-2, dim2=-1).mean(-1) > 0).all())
+    factor, info = torch.linalg.cholesky_ex(covariance)
+    return not bool(info.any()) and bool(factor.isfinite().all())
+
+
 def _warn_of_units(dynamics: object, observation: Tensor) -> None:
     """Say so where the first observations lie far from what a model says that it has seen."""
     box = getattr(dynamics, "box", None)

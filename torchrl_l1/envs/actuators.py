@@ -38,18 +38,27 @@ class _Actuator(HeldDisturbance):
         self._started(action)
         self._check_shape(action)
         executed = self._disturb(action, self._current(action))
-        following = self._advance(action, executed)
-        if following:
-            self._keep(following, tensordict.get("_step", None), action.shape[:-1])
+        self._following = self._advance(action, executed)
         return tensordict.set(self.key, executed)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        # Not before: a transform nearer to the plant may have skipped the step.
+        if self._following:
+            self._keep(self._following, tensordict.get("_step", None), tensordict.batch_size)
+            self._following = {}
+        return next_tensordict
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         parent = self.parent
         if parent is not None:
-            action = parent.full_action_spec[self.key].zero()
+            spec = parent.full_action_spec[self.key]
+            # An environment that is not batch-locked decides on more dimensions at reset.
+            extra = tensordict_reset.batch_size[: tensordict_reset.ndim - len(parent.batch_size)]
+            action = spec.zero(extra)
             self._restart(action, tensordict.get("_reset", None))
+            self.check_order(bool(self._state))
         return tensordict_reset
 
     _reset_on_native_autoreset = _reset

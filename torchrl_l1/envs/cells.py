@@ -118,13 +118,13 @@ class GymnasiumCell:
     def horizon(self) -> int | None:
         """See :class:`Cell`."""
         env: Any = self.env
+        limits = []
         while env is not env.unwrapped:
-            limit = env.__dict__.get("_max_episode_steps")
-            if isinstance(limit, int) and limit > 0:
-                return limit
+            limits.append(env.__dict__.get("_max_episode_steps"))
             env = env.env
+        told = [limit for limit in limits if isinstance(limit, int) and limit > 0]
         spec = self.env.spec
-        return None if spec is None else spec.max_episode_steps
+        return min(told, default=None if spec is None else spec.max_episode_steps)
 
     def simulation(self) -> Any:
         """See :class:`Cell`."""

@@ -9,10 +9,19 @@ from typing import ClassVar
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.envs import Transform
+from torchrl.envs import (
+    FrameSkipTransform,
+    MultiAction,
+    NoopResetEnv,
+    SerialEnv,
+    Transform,
+    TransformedEnv,
+)
+
+from torchrl_l1.control import L1Transform, OracleTransform
 
 Draw = Callable[[torch.Size], Tensor]
-"""Makes values of a shape: for each environment, drawn again whenever that environment resets."""
+"""Makes values of a shape, or with one for all entries: drawn again as that environment resets."""
 
 Value = float | Sequence[float] | Tensor | Draw
 """A number, one for each entry, one for each environment ``(*batch, 1 or entries)``, or drawn."""
@@ -59,10 +68,62 @@ class Uniform:
         return self.low + (self.high - self.low) * torch.rand(shape)
 
 
+def where_stepped(tensordict: TensorDictBase, key: NestedKey, seen: Tensor) -> Tensor:
+    """What is seen after a step; before it where a ``"_step"`` mask leaves an environment out."""
+    stepped, before = tensordict.get("_step", None), tensordict.get(key, None)
+    if stepped is None or before is None:
+        return seen
+    return torch.where(stepped.reshape(*seen.shape[:-1], -1).any(-1, keepdim=True), seen, before)
+
+
 class EnvironmentTransform(Transform):
     """A transform of environments, with the reason why stored data must not pass it."""
 
     reason: ClassVar[str]
+    disturbs: ClassVar[str]
+
+    def check_order(self, remembers: bool) -> None:
+        """Refuse transforms before or after this one, with which it would not do what it says.
+
+        A controller before it, or in a transformed environment inside, takes a disturbed action for
+        the policy's. Some transforms after it step the environment through copies of it; a frame
+        skip also hands these an action that is disturbed already.
+
+        Args:
+            remembers: whether this one has a state, which copies would not share.
+
+        Raises:
+            ValueError: naming the transform and the right order.
+        """
+        environment = self.container
+        if environment is None:
+            return
+        mine, chain = type(self).__name__, list(environment.transform.modules())
+        place = next(index for index, member in enumerate(chain) if member is self)
+        before, inside = chain[:place], environment.base_env
+        while isinstance(inside, (TransformedEnv, SerialEnv)):
+            if isinstance(inside, SerialEnv):
+                inside = next(iter(inside.__dict__.get("_envs", [])), None)
+            else:
+                before += inside.transform.modules()
+                inside = inside.base_env
+        for earlier in before if self.disturbs == "action" else ():
+            if isinstance(earlier, (L1Transform, OracleTransform)):
+                other = type(earlier).__name__
+                raise ValueError(
+                    f"{mine} comes after {other}, so that it disturbs the policy's action and not "
+                    f"what {other} sends to the actuators: put {mine} before {other}"
+                )
+        for later in chain[place + 1 :]:
+            skips = isinstance(later, FrameSkipTransform) and later.frame_skip > 1
+            steps = skips or isinstance(later, (MultiAction, NoopResetEnv))
+            if steps and (remembers or (skips and self.disturbs == "action")):
+                other = type(later).__name__
+                raise ValueError(
+                    f"{other} comes after {mine} and steps the environment through copies of what "
+                    f"is before it, which would disturb it in another way: put {other} before "
+                    f"{mine}, or around it, TransformedEnv(env, {other}(...), auto_unwrap=False)"
+                )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Refuse to work on stored data.
@@ -99,6 +160,7 @@ class HeldDisturbance(EnvironmentTransform):
             self._check(tensor)
         self.register_buffer("value", tensor)
         self._state: Mapping[str, Tensor] = {}
+        self._following: Mapping[str, Tensor] = {}
 
     def _check(self, value: Tensor) -> None:
         """Refuse values that the disturbance cannot have."""
@@ -115,6 +177,11 @@ class HeldDisturbance(EnvironmentTransform):
         if self.draw is None:
             return {}
         value = self.draw(entry.shape).to(entry.device)
+        if value.shape not in (entry.shape, (*entry.shape[:-1], 1)) or not value.isfinite().all():
+            raise ValueError(
+                f"{type(self).__name__} drew values of shape {tuple(value.shape)}, expected finite "
+                f"ones of shape {tuple(entry.shape)}, or {(*entry.shape[:-1], 1)}"
+            )
         self._check(value)
         return {"value": value}
 

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase, GymEnv, GymWrapper
 
 from torchrl_l1.envs.cells import PAGE, Cell, GymnasiumCell, TorchRLCell
 from torchrl_l1.envs.known_rewards import Outcome
-from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
+from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv, keep_others, stepped_rows
 from torchrl_l1.envs.plant import disturbed_model
 from torchrl_l1.envs.references import making
 from torchrl_l1.envs.sources import EnvironmentSource, environment_source
@@ -172,7 +172,7 @@ class ExternalEnv(EnvBase):
     nothing that was before. Actions are clipped to the bounds, as an actuator would. Where an
     observation or reward is not finite, that step has ``("next", "non_finite")`` and
     ``("next", "terminated")`` set, its next observation repeats the last good one and its reward is
-    zero.
+    zero. Environments that a ``"_step"`` mask leaves out stay as they are.
 
     Args:
         task: what the environments are.
@@ -255,20 +255,25 @@ class ExternalEnv(EnvBase):
         return self._data({}, *(np.zeros(self.num_envs, dtype=bool) for _ in range(3)))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        stepped = stepped_rows(tensordict, self.num_envs)
         actions = tensordict.get("action").detach().float().numpy().clip(self._low, self._high)
+        chosen = np.ones(self.num_envs, dtype=bool) if stepped is None else stepped.numpy()
+        actions[~chosen] = 0.0
         if not np.isfinite(actions).all():
             raise BadAction("'action' is not finite; check the policy's output")
         reward = np.zeros(self.num_envs, dtype=np.float32)
         bad, terminated, truncated = (np.zeros(self.num_envs, dtype=bool) for _ in range(3))
-        for index, (cell, action) in enumerate(zip(self.cells, actions, strict=True)):
-            observation, earned, terminated[index], truncated[index] = cell.step(action)
+        for index in np.flatnonzero(chosen):
+            stepping = self.cells[index].step(actions[index])
+            observation, earned, terminated[index], truncated[index] = stepping
             bad[index] = not (np.isfinite(observation).all() and np.isfinite(earned))
             if not bad[index]:
                 self._observation[index], reward[index] = observation, earned
-        self._steps += 1
+        self._steps += chosen
         truncated |= self._steps >= self.max_steps
         earned_ = {"reward": torch.from_numpy(reward).unsqueeze(-1).to(self._dtype)}
-        return self._data(earned_, bad, terminated | bad, truncated)
+        data = self._data(earned_, bad, terminated | bad, truncated)
+        return data if stepped is None else keep_others(data, tensordict, stepped)
 
     def _data(
         self,

@@ -18,12 +18,30 @@ from torchrl_l1.envs.task import Task
 from torchrl_l1.envs.tasks import built_in_task
 
 
+def stepped_rows(tensordict: TensorDictBase, num_envs: int) -> Tensor | None:
+    """Which environments a ``"_step"`` mask lets step ``(N,)``; ``None`` where there is no mask."""
+    mask = tensordict.get("_step", None)
+    return None if mask is None else mask.reshape(num_envs, -1).any(-1)
+
+
+def keep_others(data: TensorDict, tensordict: TensorDictBase, stepped: Tensor) -> TensorDict:
+    """Give environments that took no step the flags that they had, and a reward of zero."""
+    mask = stepped.unsqueeze(-1)
+    for name in ("non_finite", "terminated", "truncated", "done"):
+        before = tensordict.get(name, None)
+        if before is not None:
+            data[name] = torch.where(mask, data[name], before)
+    data["reward"] = data["reward"].masked_fill(~mask, 0.0)
+    return data
+
+
 class BatchedMujocoEnv(EnvBase):
     """A MuJoCo benchmark task with ``num_envs`` environments in one process.
 
     The physics is Gymnasium's to the bit (the same XML and ``mj_step``, the whole integration state
     kept from step to step); observations, rewards, resets and termination come from the
-    :class:`Task`. Environments reset independently through the usual ``"_reset"`` mask.
+    :class:`Task`. Environments reset independently through the usual ``"_reset"`` mask. Those
+    that a ``"_step"`` mask leaves out stay as they are, with a reward of zero.
 
     Reward and termination are evaluated in float64 on the clean state and on the action that this
     environment receives (noise and disturbances upstream included, before MuJoCo's clamping).
@@ -171,11 +189,12 @@ class BatchedMujocoEnv(EnvBase):
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        reward, terminated, bad = self._simulation.step(tensordict.get("action"))
-        self._steps += 1
+        stepped = stepped_rows(tensordict, self.num_envs)
+        reward, terminated, bad = self._simulation.step(tensordict.get("action"), stepped)
+        self._steps += 1 if stepped is None else stepped.numpy()
         terminated = terminated.unsqueeze(-1)
         truncated = torch.from_numpy(self._steps >= self.max_steps).unsqueeze(-1)
-        return TensorDict(
+        data = TensorDict(
             {
                 "observation": self._emitted(),
                 "non_finite": bad.unsqueeze(-1),
@@ -187,3 +206,4 @@ class BatchedMujocoEnv(EnvBase):
             batch_size=self.batch_size,
             device=self.device,
         )
+        return data if stepped is None else keep_others(data, tensordict, stepped)

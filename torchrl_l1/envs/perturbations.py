@@ -23,7 +23,7 @@ from torchrl_l1.envs.actuators import (
     Stiction,
     WalkBias,
 )
-from torchrl_l1.envs.disturbances import EnvironmentTransform, RandomSigns
+from torchrl_l1.envs.disturbances import EnvironmentTransform, RandomSigns, where_stepped
 from torchrl_l1.envs.plant import check_plant
 from torchrl_l1.envs.sensors import SensorBias, SensorDelay, SensorDropout
 
@@ -86,6 +86,12 @@ class ActionNoise(_UniformNoise):
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.set(self.key, self._noisy(tensordict.get(self.key)))
 
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        self.check_order(remembers=False)
+        return tensordict_reset
+
 
 class ObservationNoise(_UniformNoise):
     r"""Noise :math:`U(-w, w)` on the observation after a step, independent per entry and step.
@@ -108,7 +114,8 @@ class ObservationNoise(_UniformNoise):
         super().__init__(half_width, observation_key)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict.set(self.key, self._noisy(next_tensordict.get(self.key)))
+        noisy = self._noisy(next_tensordict.get(self.key))
+        return next_tensordict.set(self.key, where_stepped(tensordict, self.key, noisy))
 
 
 # Key of the metadata of a field.

@@ -11,7 +11,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from torchrl_l1.envs.disturbances import DelayLine, HeldDisturbance, Value
+from torchrl_l1.envs.disturbances import DelayLine, HeldDisturbance, Value, where_stepped
 
 
 class _Sensor(HeldDisturbance):
@@ -36,13 +36,14 @@ class _Sensor(HeldDisturbance):
         seen, following = self._read(reading)
         if following:
             self._keep(following, tensordict.get("_step", None), reading.shape[:-1])
-        return next_tensordict.set(self.key, seen)
+        return next_tensordict.set(self.key, where_stepped(tensordict, self.key, seen))
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         reading, reset = tensordict_reset.get(self.key), tensordict.get("_reset", None)
         self._restart(reading, reset)
+        self.check_order(bool(self._state))
         seen = self._first(reading)
         if reset is not None:
             # The others' entries are those that they had, disturbed already.

@@ -117,8 +117,8 @@ class BatchedSimulator:
         if forces is not None:
             self.batch.bind("xfrc_applied")[chosen] = forces[chosen]
 
-    def step(self, control: np.ndarray) -> np.ndarray:
-        """Advance every environment by one environment step.
+    def step(self, control: np.ndarray, indices: np.ndarray | None = None) -> np.ndarray:
+        """Advance environments by one environment step.
 
         Where the simulation turns bad (MuJoCo's warnings of a bad position, velocity or
         acceleration, upon which it silently restarts from the XML's pose), the environment is put
@@ -126,6 +126,7 @@ class BatchedSimulator:
 
         Args:
             control: actuator inputs ``(N, m)``, float64; MuJoCo clamps them where the XML says so.
+            indices: the environments meant; all ``N`` by default.
 
         Returns:
             Boolean ``(N,)``: which environments turned bad.
@@ -133,7 +134,7 @@ class BatchedSimulator:
         batch = self.batch
         before = batch.state.copy()
         self._ctrl[:] = control
-        batch.step(nstep=self.task.frame_skip)
+        batch.step(indices, nstep=self.task.frame_skip)
         # MuJoCo checks at the start of a step: what the last one produced is unchecked. A maximum
         # is NaN as soon as one entry is, and fails the comparison as well.
         sound = np.abs(self.qpos).max() <= MAX_MAGNITUDE >= np.abs(self.qvel).max()
@@ -238,32 +239,38 @@ class TaskSimulation:
         # The others keep entries that belong to the step they took.
         self.observation = torch.where(chosen, fresh, self.observation)
 
-    def step(self, action: Tensor) -> TaskStep:
-        """Advance every environment by one environment step.
+    def step(self, action: Tensor, stepped: Tensor | None = None) -> TaskStep:
+        """Advance environments by one environment step.
 
         An environment whose simulation turns bad keeps its state and its observation.
 
         Args:
             action: ``(N, m)``; MuJoCo clamps it where the XML says so.
+            stepped: which environments take the step ``(N,)``, bool; all if ``None``. The others
+                stay as they are, whatever their action is.
 
         Raises:
             ValueError: if the shape is wrong, or an entry is not finite or beyond 1e10.
         """
-        action = self._checked(action)
+        action = self._checked(action, stepped)
         before = self.simulator.qpos.copy()
-        bad = torch.from_numpy(self.simulator.step(action.numpy()))
+        indices = None if stepped is None else np.flatnonzero(stepped.numpy())
+        bad = torch.from_numpy(self.simulator.step(action.numpy(), indices))
         previous, following = self.observation, self._observe(before)
-        if bad.any():
-            following = torch.where(bad.unsqueeze(-1), previous, following)
+        kept = bad if stepped is None else bad | ~stepped
+        if kept.any():
+            following = torch.where(kept.unsqueeze(-1), previous, following)
         self.observation = following
         reward = self.task.reward(previous, action, following)
         return TaskStep(reward, self.task.terminated(following) | bad, bad)
 
-    def _checked(self, action: Tensor) -> Tensor:
+    def _checked(self, action: Tensor, stepped: Tensor | None) -> Tensor:
         expected = (self.simulator.num_envs, self.task.action_dim)
         if tuple(action.shape) != expected:
             raise ValueError(f"'action' has shape {tuple(action.shape)}, expected {expected}")
         action = action.detach().to(torch.float64)
+        if stepped is not None:
+            action = action.masked_fill(~stepped.unsqueeze(-1), 0.0)
         magnitude = np.abs(action.numpy())
         # Written so that NaN fails too; MuJoCo would replace such an input by zero.
         if not magnitude.max() <= MAX_MAGNITUDE:

@@ -276,6 +276,8 @@ def _draw(axis: Axes, panel: Panel) -> list[np.ndarray]:
             if not run.finished:
                 axis.plot([], [], ":", color="0.2", linewidth=0.8, label="unfinished run")
         done = [run for run in line.runs if run.finished]
+        if not done:  # no mean, whose entry in the legend would say what the colour is
+            _line(axis, steps[:0], values[:0], line.style, line.color, 2.2, label=line.label)
         if done:
             steps, means = np.mean(
                 [[values[panel.part(r)] for values in (panel.along(r), r.returns)] for r in done],

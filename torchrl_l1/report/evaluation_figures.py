@@ -43,6 +43,8 @@ _COLORS = 6
 # Panels of disturbances side by side.
 _MOST_ACROSS = 4
 _MARKERS = "osD^vP"
+# Lines over others let those show through, as where two controllers are as good.
+_OVER: Sequence[Any] = ("-", "-", (0, (4, 3)), (0, (1, 3)))
 
 
 def plot_ablation(rows: Sequence[Row], file: Path, name: str = "") -> Path:
@@ -218,8 +220,8 @@ def _draw_disturbance(
         shade = color(3 + index, tested)
         values = [row[value.line] for row in line]
         axis.plot(
-            [row[what] for row in line], values, "o-", color=shade, markersize=4,
-            label=arm_label(tested),
+            [row[what] for row in line], values, color=shade, label=arm_label(tested),
+            marker="o", markersize=max(8 - 2 * index, 2), linestyle=_OVER[min(index, 3)],
         )  # fmt: skip
         shown.append(values)
         limits = [row for row in line if row.get(value.low) is not None]
