@@ -59,6 +59,22 @@ def campaign(write_run: WriteRun, tmp_path: Path) -> Path:
     return folder
 
 
+def test_no_file_of_a_report_takes_the_place_of_another(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    tests = {name: evaluations(0)["disturbances"] for name in ("training", "disturbances")}
+    for bias in ("0.0", "0.5", "-0.5"):
+        write_run([-3, -2, -1], "l1=off", f"perturbation.actuator_bias={bias}", evaluations=tests)
+    page = report([tmp_path])
+    files = re.findall(r"\]\((?:\./)?([^)]+)\)", page.read_text())
+    assert len(set(files)) == len(files)
+    assert all((page.parent / file).is_file() for file in files)
+    assert sum("actuator_bias_0_5" in file for file in files) == 2
+    tables = [(page.parent / f"training{number}.csv").read_text() for number in ("", "_2")]
+    assert ["real_steps" in table for table in tables] == [True, False]
+    assert ["return_values" in table for table in tables] == [False, True]
+
+
 def test_report_joins_tables_and_figures(campaign: Path, tmp_path: Path) -> None:
     curves = tmp_path / "curves.csv"
     curves.write_text(CURVES)

@@ -76,6 +76,25 @@ def test_a_corrupt_file_is_named(
         assert run.final == -7.0
 
 
+def test_an_evaluation_of_before_the_run_has_gone_on_is_left_out(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    row = {"l1": "paper", "noise": "none", "bias": 0, "gain": 1, "policy": "stochastic"}
+    row |= {"return_mean": -1, "episodes": 25}
+    tests = {name: [row] for name in ("now", "then", "damaged", "older")}
+    run = write_run([-9, -7, -5], evaluations=tests)
+    growing = write_run([-9, -7, -5], iterations=9, evaluations=tests)
+    for path in (run, growing):
+        (path / "evaluations" / "now.yaml").write_text("iterations: 3\n")
+        (path / "evaluations" / "then.yaml").write_text("iterations: 2\n")
+        (path / "evaluations" / "damaged.yaml").write_text("iterations: [\n")
+    found = find_readable_runs([tmp_path])
+    assert set(found.runs[0].evaluations) == {"now", "damaged", "older"}
+    (error,) = found.errors
+    assert str(run / "evaluations" / "then.csv") in str(error)
+    assert "made after 2 iterations, and the run has 3" in str(error)
+
+
 def test_what_cannot_be_read_is_left_out_and_the_rest_stays(
     write_run: WriteRun, tmp_path: Path
 ) -> None:
