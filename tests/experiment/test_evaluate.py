@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import csv
+import io
+import shutil
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -64,6 +67,40 @@ def test_evaluate_writes_table_and_plot(
     printed = capsys.readouterr().out
     assert "deterministic policy" in printed
     assert "robustness.png" in printed
+
+
+def test_tables_do_not_depend_on_what_reads_the_output(
+    tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory = run(tiny_recipe("l1=off"))
+    options = ["--l1", "off", "--bias", "0", "--policy", "deterministic"]
+    command = ["evaluate", str(directory), *options, "--episodes", "1", "--output"]
+    latin = io.TextIOWrapper(io.BytesIO(), encoding="latin-1")
+    monkeypatch.setattr(sys, "stdout", latin)
+    main([*command, str(tmp_path / "δ")])
+    assert rb"/\u03b4/evaluation.csv" in latin.buffer.getvalue()
+
+    class Ended(io.StringIO):
+        def write(self, text: str) -> int:
+            raise BrokenPipeError
+
+    monkeypatch.setattr(sys, "stdout", Ended())
+    with pytest.raises(SystemExit):
+        main([*command, str(tmp_path / "ended")])
+    monkeypatch.undo()
+    for name in ("evaluation", "episodes", "summary"):
+        one, other = (tmp_path / folder / f"{name}.csv" for folder in ("δ", "ended"))
+        assert one.read_text() == other.read_text()
+
+
+def test_a_copy_of_a_run_is_no_second_seed(
+    tiny_recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    directory = run(tiny_recipe("l1=off", "outer_iterations=1"))
+    shutil.copytree(directory, tmp_path / "copy")
+    with pytest.raises(SystemExit):
+        main(["evaluate", str(directory), str(tmp_path / "copy"), "--episodes", "1"])
+    assert "are both of seed 0, one training and no two" in capsys.readouterr().err
 
 
 def test_cells_share_their_random_numbers_and_see_their_disturbance(tiny_recipe: Recipe) -> None:

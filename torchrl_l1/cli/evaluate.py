@@ -196,6 +196,14 @@ def _check_one_study(runs: Sequence[TrainedRun]) -> None:
                 f"{runs[0].path} and {trained.path} differ in more than their seed; evaluate them "
                 "one at a time"
             )
+    seeds: dict[int, TrainedRun] = {}
+    for trained in runs:
+        other = seeds.setdefault(trained.recipe.seed, trained)
+        if other is not trained:  # a copy would count twice, and make intervals narrow
+            raise ValueError(
+                f"{other.name} and {trained.name} are both of seed {trained.recipe.seed}, one "
+                "training and no two; leave one of them out"
+            )
 
 
 def _stages(runs: Sequence[TrainedRun], asked: Sequence[str]) -> list[str]:
@@ -271,10 +279,11 @@ def evaluate_command(options: argparse.Namespace) -> None:
                 progress.update()
 
     summary = summarize(rows, episodes)
-    print(f"\n{runs[0].recipe.task}: {summary_tables(summary)}\n")
+    # Before anything is printed: what reads the output may have ended long ago.
     tables = {"evaluation": rows, "episodes": episodes, "summary": summary}
     for name, table in tables.items():
         write_table(output / f"{name}.csv", table)
+    print(f"\n{runs[0].recipe.task}: {summary_tables(summary)}\n")
     plots = _plots(summary, runs[0], output)
     print(f"Table: {', '.join(str(output / f'{name}.csv') for name in tables)}")
     print(f"Plot: {', '.join(map(str, plots))}")

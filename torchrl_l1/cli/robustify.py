@@ -102,9 +102,10 @@ def robustify_command(options: argparse.Namespace) -> None:
         most_steps=options.most_steps,
         seed=options.seed,
     )
-    print(f"\n{table.words}\n\n{table}\n")
+    # Before anything is printed: what reads the output may have ended long ago.
     write_table(output / "evaluation.csv", table.rows)
     write_table(output / "episodes.csv", table.episodes)
+    print(f"\n{table.words}\n\n{table}\n")
     chart = table.plot(output / "evaluation.png")
     usage = usage_lines(robust, folder)
     write_atomically(output / "README.md", page(options, robust, table, usage))
