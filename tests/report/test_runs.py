@@ -55,6 +55,8 @@ def spoil(file: Path, before: str, after: str) -> None:
         ("versions.json", "{", "[[", "cannot read"),
         ("evaluations/ablation.csv", "bias", "offset", "no column bias"),
         ("evaluations/ablation.csv", "paper", "", "line 2: l1 is empty"),
+        ("evaluations/ablation.csv", "none,0,", "none,0,5,", "line 2: more values than the 7"),
+        ("evaluations/ablation.csv", "-1,25", "-1,25\npaper,none,0,1,stochastic,-2,25", "line 3"),
     ],
 )
 def test_a_corrupt_file_is_named(
@@ -74,6 +76,25 @@ def test_a_corrupt_file_is_named(
     else:
         (run,) = find_readable_runs([tmp_path]).runs
         assert run.final == -7.0
+
+
+def test_what_a_table_repeats_counts_once(write_run: WriteRun, tmp_path: Path) -> None:
+    row = {"l1": "paper", "noise": "none", "bias": 0, "gain": 1, "policy": "stochastic"}
+    table = [row | {"return_mean": -1, "episodes": 2}]
+    episodes = [row | {"episode": number, "return": -number} for number in (0, 1)]
+    tests = {"mine": 2 * table, "episodes/mine": 2 * episodes}
+    write_run([-9], evaluations=tests)
+    write_run(
+        [-9],
+        seed=1,
+        evaluations={**tests, "episodes/mine": [*episodes, episodes[0] | {"return": 3}]},
+    )
+    found = find_readable_runs([tmp_path])
+    (test,) = found.runs[0].evaluations["mine"]
+    assert test.returns == (0.0, -1.0)
+    assert not found.runs[1].evaluations
+    (error,) = found.errors
+    assert "episodes/mine.csv, line 4: what it says of L1 paper" in str(error)
 
 
 def test_an_evaluation_of_before_the_run_has_gone_on_is_left_out(
