@@ -260,6 +260,12 @@ def test_a_copy_of_a_recipe_is_that_recipe_under_another_name(name: str, tmp_pat
     assert mine == shipped
 
 
+@pytest.mark.parametrize("name", ["a: b", "x #1", "1e3", "true", r"a\d", "it's", "Größe 2"])
+def test_a_copy_may_have_any_name(name: str, tmp_path: Path) -> None:
+    copy = copy_recipe("pets/half_cheetah", str(tmp_path / f"{name}.yaml"))
+    assert composed(str(copy)).recipe == name
+
+
 def test_copies_have_names_and_replace_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -230,15 +231,14 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 def test_command_says_where_the_files_are(
     write_run: WriteRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = write_run([-2, -1], "l1=off")
-    output = tmp_path / "out"
+    run = write_run([-2, -1], "l1=off", name=os.fsdecode(b"caf\xe9"))
+    output = tmp_path / "out of l1"
     main(["report", str(run), str(run.parent), "--output", str(output)])
     printed = capsys.readouterr().out
     assert f"Report: {output / 'report.md'}" in printed
-    assert (
-        f"$ torchrl-l1 report {run} {run.parent} --output {output}\n"
-        in (output / "report.md").read_text()
-    )
+    words = f"'{run.parent}/caf\\udce9' {run.parent} --output '{output}'"
+    assert f"$ torchrl-l1 report {words}\n" in (output / "report.md").read_text()
+    assert "caf\\udce9" in (output / "runs.csv").read_text()
 
 
 def test_bad_requests_are_refused_before_anything_is_written(

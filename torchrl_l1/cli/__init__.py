@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -251,7 +252,7 @@ def _recipes(copy: Sequence[str] | None) -> None:
         raise ValueError(f"--copy takes a NAME and perhaps a FILE, got {' '.join(copy)}")
     file = copy_recipe(*copy)
     command = "campaign" if copy[0] in available_campaigns() else "run"
-    print(f"{file} is yours: torchrl-l1 {command} {file}")
+    print(f"{file} is yours: torchrl-l1 {command} {shlex.quote(str(file))}")
 
 
 def _run(options: argparse.Namespace, overrides: list[str]) -> None:

@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 
 import torchrl_l1
 from torchrl_l1.experiment.errors import RecipeError
+from torchrl_l1.experiment.files import yaml_word
 
 # Folders beside the recipes: their groups, and matrices of runs.
 _NOT_RECIPES = ("shared", "campaigns")
@@ -103,7 +104,8 @@ def copy_recipe(name: str, file: str | None = None) -> Path:
     if copy.suffix != ".yaml" or not copy.stem.strip("."):
         raise RecipeError(f"the copy's name must end in .yaml, got {copy}")
     text = source.read_text(encoding="utf-8")
-    text = re.sub(r"(?m)^recipe: \S+$", f"recipe: {copy.stem}", text)
+    named = f"recipe: {yaml_word(copy.stem)}"
+    text = re.sub(r"(?m)^recipe: \S+$", lambda _: named, text)
     try:
         with copy.open("x", encoding="utf-8") as handle:
             handle.write(text)

@@ -82,7 +82,7 @@ class Page:
 
     def render(self) -> str:
         """The Markdown."""
-        return "\n\n".join(self._blocks) + "\n"
+        return _writable("\n\n".join(self._blocks) + "\n")
 
 
 def plain(text: object) -> str:
@@ -110,8 +110,14 @@ def code(text: object) -> str:
     return f"`{line.replace('`', chr(39)).replace('|', chr(166))}`"
 
 
+def _writable(text: str) -> str:
+    """A text with the bytes of paths escaped that are no UTF-8."""
+    return text.encode(errors="backslashreplace").decode()
+
+
 def _cell(value: object) -> object:
     """A value of a CSV: text that a spreadsheet would take for a formula is quoted."""
+    value = _writable(value) if isinstance(value, str) else value
     if isinstance(value, str) and re.match(r"[=+@\t\r]|-(?![\d.])", value):
         return f"'{value}"
     return value
