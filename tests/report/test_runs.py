@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -76,6 +78,25 @@ def test_a_corrupt_file_is_named(
     else:
         (run,) = find_readable_runs([tmp_path]).runs
         assert run.final == -7.0
+
+
+def test_a_folder_that_cannot_be_looked_into_is_listed(
+    write_run: WriteRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = write_run([-9], name="open/seed_0")
+    closed = write_run([-9], name="closed/seed_0", seed=1).parent
+    scandir = os.scandir
+
+    def refusing(path: str) -> Any:  # tests may run as root, who may look everywhere
+        if Path(path) == closed:
+            raise PermissionError(13, "Permission denied", str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", refusing)
+    found = find_readable_runs([tmp_path])
+    assert [one.path for one in found.runs] == [run]
+    (error,) = found.errors
+    assert f"cannot look into {closed}: Permission denied" in str(error)
 
 
 def test_what_a_table_repeats_counts_once(write_run: WriteRun, tmp_path: Path) -> None:

@@ -65,10 +65,15 @@ def path_text(text: str) -> str:
 def bounded_overrides(dirname: str) -> str:
     """Hydra's name for a list of overrides, with the shortest of them and a digest if it is long.
 
+    A path among them leads down only: ``..`` would take away what stands before it in the name.
+
     Examples:
         >>> bounded_overrides("l1=off,noise=action")
         'l1=off,noise=action'
+        >>> bounded_overrides("cem.horizon=5,dataset=../../data/mine.npz")
+        'cem.horizon=5,dataset=../__/data/mine.npz'
     """
+    dirname = re.sub(r"/\.\.(?=/|$)", "/__", dirname)
     parts = [
         path_text(part) if part.startswith("task=") else part
         for part in re.split(r",(?=[\w+~][\w.@/+~-]*=)", dirname)
