@@ -7,8 +7,10 @@ What is meant to change is written anew by
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import os
 from functools import cache
 from pathlib import Path
 
@@ -266,6 +268,21 @@ def test_a_copy_may_have_any_name(name: str, tmp_path: Path) -> None:
     assert composed(str(copy)).recipe == name
 
 
+def test_no_part_of_a_copy_is_left_where_there_is_no_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left") as caught:
+        copy_recipe("table1", str(tmp_path / "mine.yaml"))
+    assert caught.value.filename == str(tmp_path / "mine.yaml")
+    assert not list(tmp_path.iterdir())
+    monkeypatch.undo()
+    copy_recipe("table1", str(tmp_path / "mine.yaml"))
+
+
 def test_copies_have_names_and_replace_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -280,6 +297,9 @@ def test_copies_have_names_and_replace_nothing(
         copy_recipe("pets/half_cheetah", "mine.yml")
     with pytest.raises(RecipeError, match="Did you mean pets/half_cheetah"):
         copy_recipe("pets/half_cheeta")
+    Path("link.yaml").symlink_to("elsewhere.yaml")
+    with pytest.raises(RecipeError, match="is there already"):
+        copy_recipe("pets/half_cheetah", "link.yaml")
     campaign = read_campaign(str(copy_recipe("table1_first")))
     assert campaign.to_dict()["runs"] == read_campaign("table1_first").to_dict()["runs"]
 

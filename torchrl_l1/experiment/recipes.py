@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from difflib import get_close_matches
 from pathlib import Path
@@ -11,7 +12,7 @@ from omegaconf import OmegaConf
 
 import torchrl_l1
 from torchrl_l1.experiment.errors import RecipeError
-from torchrl_l1.experiment.files import yaml_word
+from torchrl_l1.experiment.files import write_atomically, yaml_word
 
 # Folders beside the recipes: their groups, and matrices of runs.
 _NOT_RECIPES = ("shared", "campaigns")
@@ -106,11 +107,10 @@ def copy_recipe(name: str, file: str | None = None) -> Path:
     text = source.read_text(encoding="utf-8")
     named = f"recipe: {yaml_word(copy.stem)}"
     text = re.sub(r"(?m)^recipe: \S+$", lambda _: named, text)
-    try:
-        with copy.open("x", encoding="utf-8") as handle:
-            handle.write(text)
-    except FileExistsError:
-        raise RecipeError(f"{copy} is there already; give another FILE") from None
+    if os.path.lexists(copy):
+        raise RecipeError(f"{copy} is there already; give another FILE")
+    # A part of a campaign may be a campaign, too.
+    write_atomically(copy, text)
     return copy
 
 
