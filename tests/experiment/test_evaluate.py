@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import csv
+import errno
 import io
+import os
 import shutil
 import sys
 from collections.abc import Callable
@@ -91,6 +93,26 @@ def test_tables_do_not_depend_on_what_reads_the_output(
     for name in ("evaluation", "episodes", "summary"):
         one, other = (tmp_path / folder / f"{name}.csv" for folder in ("δ", "ended"))
         assert one.read_text() == other.read_text()
+
+
+def test_a_folder_that_takes_no_results_is_told_before_the_work(
+    tiny_recipe: Recipe,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    directory = run(tiny_recipe("l1=off", "outer_iterations=1"))
+    monkeypatch.setattr(evaluate_command, "evaluate_episodes", None)
+
+    def read_only(descriptor: int) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(os, "fsync", read_only)
+    with pytest.raises(SystemExit):
+        main(["evaluate", str(directory), "--output", str(tmp_path / "out")])
+    told = capsys.readouterr().err
+    assert f"{tmp_path / 'out'}: Read-only file system; choose a place" in told
+    assert not list((tmp_path / "out").iterdir())
 
 
 def test_a_copy_of_a_run_is_no_second_seed(

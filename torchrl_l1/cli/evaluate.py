@@ -29,7 +29,7 @@ from torchrl_l1.experiment.evaluate import (
     make_collection,
     reachable,
 )
-from torchrl_l1.experiment.files import refuse_link, write_table
+from torchrl_l1.experiment.files import make_folder, refuse_link, write_table
 from torchrl_l1.experiment.l1_options import check_tested
 from torchrl_l1.experiment.matrix import (
     SUITE_L1,
@@ -268,7 +268,7 @@ def evaluate_command(options: argparse.Namespace) -> None:
     output = Path(options.output) if options.output else runs[0].path / folder
     if not options.output:
         refuse_link(output)
-    output.mkdir(parents=True, exist_ok=True)
+    make_folder(output)
     rows, episodes = [], []
     total = len(runs) * len(cells)
     with tqdm(total=total, desc="evaluate", unit="cell", disable=None) as progress:

@@ -103,6 +103,21 @@ def refuse_link(path: Path) -> None:
         )
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder, and find out before hours of work whether results can be written to it.
+
+    Raises:
+        OSError: with the name of the folder.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    probe = folder / ".writable"
+    try:
+        write_atomically(probe, "")
+        probe.unlink()
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(folder)) from error
+
+
 @contextmanager
 def locked(file: Path, mode: str = "a") -> Iterator[bool]:
     """Lock a file for as long as the block lasts, or say that another process has.
