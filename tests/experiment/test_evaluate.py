@@ -214,6 +214,8 @@ def test_a_suite_ends_in_a_table_of_what_is_recovered(
         (["evaluate", "nowhere", "--alpha", "nan"], "--alpha must be above 0 and at most 1"),
         (["evaluate", "nowhere", "--bias", "0", "inf"], "--bias must be finite, got inf"),
         (["evaluate", "nowhere", "--gain", "weak"], "argument --gain: invalid float value"),
+        (["evaluate", "nowhere", "--dropout", "0", "2"], "--dropout: SensorDropout: a probability"),
+        (["evaluate", "nowhere", "--mass", "-1"], "--mass: mass must be positive, got -1.0"),
         (["evaluate", "nowhere", "--policy", "greedy"], "argument --policy: invalid choice"),
         (["verify", "nowhere.npz"], "no trace file"),
         (["run", "metrpo/inverted_pendlum"], "Did you mean metrpo/inverted_pendulum"),
@@ -232,6 +234,20 @@ def test_bad_requests_exit_with_one_clear_line(
     assert exit_info.value.code != 0
     assert message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_values_that_a_controller_has_not_are_refused_before_the_work(
+    tiny_recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    directory = run(tiny_recipe("l1=off", "outer_iterations=1"))
+    options = ["--l1", "off", "robust", "--alpha", "0.1", "--output", str(tmp_path / "out")]
+    with pytest.raises(SystemExit):
+        main(["evaluate", str(directory), *options])
+    assert "L1 robust alpha=0.1: cutoff and alpha belong to" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    cells = [Condition("off"), Condition("robust", alpha=0.1)]
+    with pytest.raises(ValueError, match="L1 robust"):
+        next(evaluate(load_run(directory), cells, 1))
 
 
 def test_typo_in_an_override_fails_and_writes_nothing(

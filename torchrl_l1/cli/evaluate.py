@@ -22,6 +22,7 @@ from torchrl_l1.envs.rendering import (
 from torchrl_l1.experiment.checkpoints import CheckpointSettings
 from torchrl_l1.experiment.evaluate import (
     TrainedRun,
+    check_controllers,
     check_plants,
     distinct,
     evaluate_episodes,
@@ -263,6 +264,7 @@ def evaluate_command(options: argparse.Namespace) -> None:
     if options.suite:  # of which none can be left out by hand
         cells = reachable(runs[0].algorithm.task, cells)
     check_plants(runs[0].algorithm.task, cells)
+    check_controllers(runs[0].recipe.l1, runs[0].algorithm.task, cells)
     # A kept checkpoint has a folder of its own: its results are not the run's.
     folder = "_".join(filter(None, ["evaluation", runs[0].checkpoint]))
     output = Path(options.output) if options.output else runs[0].path / folder
