@@ -474,8 +474,8 @@ def run_directories(folder: Path) -> Iterator[tuple[Path, dict[str, Any] | RunDi
         if isinstance(config, RunDirectoryError) or ("task" in config and "seed" in config):
             below.clear()
             yield Path(path), config
-    for error in closed:
-        yield Path(error.filename), RunDirectoryError(f"cannot look into {message(error)}")
+    for refusal in closed:
+        yield Path(refusal.filename), RunDirectoryError(f"cannot look into {message(refusal)}")
 
 
 def read_config(file: Path) -> dict[str, Any]:
