@@ -99,7 +99,8 @@ def _of_override(text: str, override: str) -> str:
     text = re.split(r"\s*See https://hydra", text)[0]
     where = "" if override in text else f"{override}: "
     key, _, value = override.partition("=")
-    word = shlex.quote(f'{key}="{value}"')
+    escaped = value.replace('"', '\\"')
+    word = shlex.quote(f'{key}="{escaped}"')
     # The directories of runs are named by overrides, so that "=" is in many a path.
     remedy = f"; a value of such characters has quotes of its own: {word}" if value else ""
     return f"{where}{text}{remedy}"
