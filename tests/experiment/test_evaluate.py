@@ -179,7 +179,7 @@ def test_a_suite_ends_in_a_table_of_what_is_recovered(
     tiny_recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     directory = run(tiny_recipe("l1=off"))
-    options = ["--suite", "quick", "--episodes", "2", "--policy", "deterministic"]
+    options = ["--suite", "quick", "--episodes", "3", "--policy", "deterministic"]
     main(["evaluate", str(directory), *options, "--output", str(tmp_path / "out")])
     printed = capsys.readouterr().out
     assert "inverted_pendulum: deterministic policy" in printed
@@ -187,7 +187,7 @@ def test_a_suite_ends_in_a_table_of_what_is_recovered(
     rows = rows_of(tmp_path / "out" / "evaluation.csv")
     assert len(rows) == len(suite("quick")) * 4
     episodes = rows_of(tmp_path / "out" / "episodes.csv")
-    assert len(episodes) == 2 * len(rows)
+    assert len(episodes) == 3 * len(rows)
     assert list(episodes[0])[:4] == ["run", "training_seed", "l1", "noise"]
     assert list(episodes[0])[-3:] == ["episode", "return", "steps"]
     summary = rows_of(tmp_path / "out" / "summary.csv")
