@@ -93,10 +93,12 @@ def test_verify_exits_by_its_verdict(capsys: pytest.CaptureFixture[str]) -> None
     assert "1 of 1 traces" in capsys.readouterr().out
     trace["x_hat"] = trace["x_hat"] + 1e-3
     np.savez("bad.npz", **{f"plant/case/{key}": value for key, value in trace.items()})
-    with pytest.raises(SystemExit) as exit_info:
-        main(["verify", "bad.npz"])
-    assert exit_info.value.code == 1
-    assert "TOO LARGE" in capsys.readouterr().out
+    for tolerance in ("1e-9", "nan"):
+        with pytest.raises(SystemExit) as exit_info:
+            main(["verify", "bad.npz", "--tolerance", tolerance])
+        assert exit_info.value.code == 1
+        printed = capsys.readouterr().out
+        assert "TOO LARGE" in printed and "0 of 1 traces" in printed
 
 
 def test_a_recipe_is_copied_to_be_edited(capsys: pytest.CaptureFixture[str]) -> None:

@@ -297,7 +297,7 @@ def test_a_file_in_the_way_and_a_full_disk_are_told_with_path_and_remedy(
     line = said(*report, "--output", str(tmp_path / "out"))
     assert str(tmp_path / "out") in line and "free some space" in line
     line = said(*evaluate)
-    assert "evaluation.csv" in line and "free some space" in line
+    assert f"{damaged / 'evaluation'}: " in line and "free some space" in line
     with pytest.raises(OSError, match=r"checkpoint\.pt"):
         RunDirectory(damaged).save_checkpoint({})
     monkeypatch.undo()

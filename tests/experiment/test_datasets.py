@@ -5,6 +5,7 @@ import errno
 import json
 import os
 import pickle
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -277,14 +278,17 @@ def test_from_a_run_to_a_dataset_to_a_policy_and_its_report(
     tiny_recipe: Callable[..., DictConfig], capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = run(tiny_recipe())
-    main(["dataset", str(source), "random.npz", "--quality", "random", "--steps", "100"])
-    assert "105 transitions in 7 episodes" in capsys.readouterr().out
-    main(["run", "offline/inverted_pendulum", "dataset=random.npz", "run_dir=runs/a", *TINY])
+    data = "l1=off, paper/random.npz"  # as run directories are named, which Hydra wants quoted
+    main(["dataset", str(source), data, "--quality", "random", "--steps", "100"])
+    printed = capsys.readouterr().out
+    assert "105 transitions in 7 episodes" in printed
+    (of_data,) = shlex.split(printed.partition("torchrl-l1 run offline/... ")[2])
+    main(["run", "offline/inverted_pendulum", of_data, "run_dir=runs/a", *TINY])
     with Path("runs/a/metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["data/transitions"] for row in rows] == ["105", "105"]
-    Path("random.npz").unlink()  # it is in the checkpoint now
-    main(["run", "offline/inverted_pendulum", "dataset=random.npz", "run_dir=runs/a", *TINY,
+    Path(data).unlink()  # it is in the checkpoint now
+    main(["run", "offline/inverted_pendulum", of_data, "run_dir=runs/a", *TINY,
           "outer_iterations=3", "--resume"])  # fmt: skip
     main(["evaluate", "runs/a", "--l1", "off", "paper", "robust", "oracle", "--bias", "0", "1",
           "--episodes", "2", "--policy", "deterministic"])  # fmt: skip

@@ -1,6 +1,11 @@
 from __future__ import annotations
 
 import csv
+import errno
+import io
+import os
+import shutil
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -66,6 +71,60 @@ def test_evaluate_writes_table_and_plot(
     assert "robustness.png" in printed
 
 
+def test_tables_do_not_depend_on_what_reads_the_output(
+    tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory = run(tiny_recipe("l1=off"))
+    options = ["--l1", "off", "--bias", "0", "--policy", "deterministic"]
+    command = ["evaluate", str(directory), *options, "--episodes", "1", "--output"]
+    latin = io.TextIOWrapper(io.BytesIO(), encoding="latin-1")
+    monkeypatch.setattr(sys, "stdout", latin)
+    main([*command, str(tmp_path / "δ")])
+    assert rb"/\u03b4/evaluation.csv" in latin.buffer.getvalue()
+
+    class Ended(io.StringIO):
+        def write(self, text: str) -> int:
+            raise BrokenPipeError
+
+    monkeypatch.setattr(sys, "stdout", Ended())
+    with pytest.raises(SystemExit):
+        main([*command, str(tmp_path / "ended")])
+    monkeypatch.undo()
+    for name in ("evaluation", "episodes", "summary"):
+        one, other = (tmp_path / folder / f"{name}.csv" for folder in ("δ", "ended"))
+        assert one.read_text() == other.read_text()
+
+
+def test_a_folder_that_takes_no_results_is_told_before_the_work(
+    tiny_recipe: Recipe,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    directory = run(tiny_recipe("l1=off", "outer_iterations=1"))
+    monkeypatch.setattr(evaluate_command, "evaluate_episodes", None)
+
+    def read_only(descriptor: int) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(os, "fsync", read_only)
+    with pytest.raises(SystemExit):
+        main(["evaluate", str(directory), "--output", str(tmp_path / "out")])
+    told = capsys.readouterr().err
+    assert f"{tmp_path / 'out'}: Read-only file system; choose a place" in told
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_a_copy_of_a_run_is_no_second_seed(
+    tiny_recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    directory = run(tiny_recipe("l1=off", "outer_iterations=1"))
+    shutil.copytree(directory, tmp_path / "copy")
+    with pytest.raises(SystemExit):
+        main(["evaluate", str(directory), str(tmp_path / "copy"), "--episodes", "1"])
+    assert "are both of seed 0, one training and no two" in capsys.readouterr().err
+
+
 def test_cells_share_their_random_numbers_and_see_their_disturbance(tiny_recipe: Recipe) -> None:
     trained = load_run(run(tiny_recipe()))
     cells = [
@@ -120,7 +179,7 @@ def test_a_suite_ends_in_a_table_of_what_is_recovered(
     tiny_recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     directory = run(tiny_recipe("l1=off"))
-    options = ["--suite", "quick", "--episodes", "2", "--policy", "deterministic"]
+    options = ["--suite", "quick", "--episodes", "3", "--policy", "deterministic"]
     main(["evaluate", str(directory), *options, "--output", str(tmp_path / "out")])
     printed = capsys.readouterr().out
     assert "inverted_pendulum: deterministic policy" in printed
@@ -128,7 +187,7 @@ def test_a_suite_ends_in_a_table_of_what_is_recovered(
     rows = rows_of(tmp_path / "out" / "evaluation.csv")
     assert len(rows) == len(suite("quick")) * 4
     episodes = rows_of(tmp_path / "out" / "episodes.csv")
-    assert len(episodes) == 2 * len(rows)
+    assert len(episodes) == 3 * len(rows)
     assert list(episodes[0])[:4] == ["run", "training_seed", "l1", "noise"]
     assert list(episodes[0])[-3:] == ["episode", "return", "steps"]
     summary = rows_of(tmp_path / "out" / "summary.csv")
@@ -155,6 +214,8 @@ def test_a_suite_ends_in_a_table_of_what_is_recovered(
         (["evaluate", "nowhere", "--alpha", "nan"], "--alpha must be above 0 and at most 1"),
         (["evaluate", "nowhere", "--bias", "0", "inf"], "--bias must be finite, got inf"),
         (["evaluate", "nowhere", "--gain", "weak"], "argument --gain: invalid float value"),
+        (["evaluate", "nowhere", "--dropout", "0", "2"], "--dropout: SensorDropout: a probability"),
+        (["evaluate", "nowhere", "--mass", "-1"], "--mass: mass must be positive, got -1.0"),
         (["evaluate", "nowhere", "--policy", "greedy"], "argument --policy: invalid choice"),
         (["verify", "nowhere.npz"], "no trace file"),
         (["run", "metrpo/inverted_pendlum"], "Did you mean metrpo/inverted_pendulum"),
@@ -173,6 +234,20 @@ def test_bad_requests_exit_with_one_clear_line(
     assert exit_info.value.code != 0
     assert message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_values_that_a_controller_has_not_are_refused_before_the_work(
+    tiny_recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    directory = run(tiny_recipe("l1=off", "outer_iterations=1"))
+    options = ["--l1", "off", "robust", "--alpha", "0.1", "--output", str(tmp_path / "out")]
+    with pytest.raises(SystemExit):
+        main(["evaluate", str(directory), *options])
+    assert "L1 robust alpha=0.1: cutoff and alpha belong to" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    cells = [Condition("off"), Condition("robust", alpha=0.1)]
+    with pytest.raises(ValueError, match="L1 robust"):
+        next(evaluate(load_run(directory), cells, 1))
 
 
 def test_typo_in_an_override_fails_and_writes_nothing(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from torchrl_l1.experiment import files
-from torchrl_l1.experiment.files import settings_content
+from torchrl_l1.experiment.files import bounded_overrides, settings_content
 
 WORDS = """
 yes No on off true ~ null .inf -.INF .NaN 2020-01-01 1e-3 1_000 0x1F 010 0b11 1:30 1:30.5
@@ -54,3 +55,12 @@ def test_plain_settings_need_no_omegaconf(tmp_path: Path, monkeypatch: pytest.Mo
     (tmp_path / "a.yaml").write_text("a: 1e-3\nb:\n  c: [x, 2020-01-01]\n  d: 'off'\n")
     expected = {"a": 1e-3, "b": {"c": ["x", "2020-01-01"], "d": "off"}}
     assert settings_content(tmp_path / "a.yaml") == expected
+
+
+@given(value=st.text("./,=a", max_size=300))
+@example(value="../../../../data/mine.npz")
+@example(value="../..")
+def test_overrides_name_a_folder_below_that_of_the_recipe(value: str) -> None:
+    name = bounded_overrides(f"horizon=5,dataset={value}")
+    folder = os.path.normpath(f"runs/mine/{name}/seed_0")
+    assert folder.startswith("runs/mine/horizon=5,")

@@ -132,6 +132,8 @@ def test_a_key_that_no_schema_knows_is_refused_with_a_plus_too(
         (["outer_iterations=many"], "outer_iterations=many"),
         (["l1=louder"], "off paper"),
         (["l1"], "missing EQUAL"),
+        (["task=a=b"], "task=a=b: mismatched input '='"),
+        (["task=a=b"], "has quotes of its own: 'task=\"a=b\"'"),
         (["l1=[off"], "[off"),
         (["seed=0,1"], "Ambiguous value"),
         (["~nothing"], "does not exist"),

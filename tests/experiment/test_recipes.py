@@ -7,8 +7,10 @@ What is meant to change is written anew by
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import os
 from functools import cache
 from pathlib import Path
 
@@ -260,6 +262,27 @@ def test_a_copy_of_a_recipe_is_that_recipe_under_another_name(name: str, tmp_pat
     assert mine == shipped
 
 
+@pytest.mark.parametrize("name", ["a: b", "x #1", "1e3", "true", r"a\d", "it's", "Größe 2"])
+def test_a_copy_may_have_any_name(name: str, tmp_path: Path) -> None:
+    copy = copy_recipe("pets/half_cheetah", str(tmp_path / f"{name}.yaml"))
+    assert composed(str(copy)).recipe == name
+
+
+def test_no_part_of_a_copy_is_left_where_there_is_no_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left") as caught:
+        copy_recipe("table1", str(tmp_path / "mine.yaml"))
+    assert caught.value.filename == str(tmp_path / "mine.yaml")
+    assert not list(tmp_path.iterdir())
+    monkeypatch.undo()
+    copy_recipe("table1", str(tmp_path / "mine.yaml"))
+
+
 def test_copies_have_names_and_replace_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -274,6 +297,9 @@ def test_copies_have_names_and_replace_nothing(
         copy_recipe("pets/half_cheetah", "mine.yml")
     with pytest.raises(RecipeError, match="Did you mean pets/half_cheetah"):
         copy_recipe("pets/half_cheeta")
+    Path("link.yaml").symlink_to("elsewhere.yaml")
+    with pytest.raises(RecipeError, match="is there already"):
+        copy_recipe("pets/half_cheetah", "link.yaml")
     campaign = read_campaign(str(copy_recipe("table1_first")))
     assert campaign.to_dict()["runs"] == read_campaign("table1_first").to_dict()["runs"]
 

@@ -81,6 +81,18 @@ def test_a_new_recipe_composes_and_needs_no_fix(
     assert "exists already" in capsys.readouterr().err
 
 
+def test_a_new_recipe_and_its_environment_may_have_any_path(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (place / "envs #1").mkdir()
+    (place / "odd.py").rename(place / "envs #1" / "odd.py")
+    source = "envs #1/odd.py:make_env"
+    main(["new-task", "a: b.yaml", "--from", source, "--horizon", "40"])
+    assert "torchrl-l1 check 'a: b.yaml'" in capsys.readouterr().out
+    config = compose("a: b.yaml")
+    assert (config.recipe, config.task) == ("a: b", source)
+
+
 def test_all_that_is_odd_is_named(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["new-task", "odd.yaml", "--from", "odd.py:make_env", "--horizon", "40"])
     assert "not known" in capsys.readouterr().out

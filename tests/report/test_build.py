@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -57,6 +58,22 @@ def campaign(write_run: WriteRun, tmp_path: Path) -> Path:
     folder = tmp_path / "runs"
     (folder / "campaign.yaml").write_text(dump_yaml(read_campaign("figure2").to_dict()))
     return folder
+
+
+def test_no_file_of_a_report_takes_the_place_of_another(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    tests = {name: evaluations(0)["disturbances"] for name in ("training", "disturbances")}
+    for bias in ("0.0", "0.5", "-0.5"):
+        write_run([-3, -2, -1], "l1=off", f"perturbation.actuator_bias={bias}", evaluations=tests)
+    page = report([tmp_path])
+    files = re.findall(r"\]\((?:\./)?([^)]+)\)", page.read_text())
+    assert len(set(files)) == len(files)
+    assert all((page.parent / file).is_file() for file in files)
+    assert sum("actuator_bias_0_5" in file for file in files) == 2
+    tables = [(page.parent / f"training{number}.csv").read_text() for number in ("", "_2")]
+    assert ["real_steps" in table for table in tables] == [True, False]
+    assert ["return_values" in table for table in tables] == [False, True]
 
 
 def test_report_joins_tables_and_figures(campaign: Path, tmp_path: Path) -> None:
@@ -214,15 +231,14 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 def test_command_says_where_the_files_are(
     write_run: WriteRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = write_run([-2, -1], "l1=off")
-    output = tmp_path / "out"
+    run = write_run([-2, -1], "l1=off", name=os.fsdecode(b"caf\xe9"))
+    output = tmp_path / "out of l1"
     main(["report", str(run), str(run.parent), "--output", str(output)])
     printed = capsys.readouterr().out
     assert f"Report: {output / 'report.md'}" in printed
-    assert (
-        f"$ torchrl-l1 report {run} {run.parent} --output {output}\n"
-        in (output / "report.md").read_text()
-    )
+    words = f"'{run.parent}/caf\\udce9' {run.parent} --output '{output}'"
+    assert f"$ torchrl-l1 report {words}\n" in (output / "report.md").read_text()
+    assert "caf\\udce9" in (output / "runs.csv").read_text()
 
 
 def test_bad_requests_are_refused_before_anything_is_written(

@@ -38,6 +38,20 @@ def evaluated(value: float, *cells: tuple[str, str, str, float]) -> list[dict[st
     ]
 
 
+def test_a_table_says_over_how_many_seeds_each_controller_was_tested(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    for seed in range(3):
+        tests = [("off", "none", "stochastic", 0.0), ("paper", "none", "stochastic", 1.0)]
+        mine = evaluated(-1.0, *tests[: 1 + (seed < 2)])
+        write_run([1.0], "l1=off", seed=seed, evaluations={"mine": mine, "ablation": mine})
+    rows = evaluation_rows(study(tmp_path), "mine")
+    assert [row["training_seeds"] for row in rows] == [3, 2]
+    for text in (evaluation_table(rows), ablation_table(ablation_rows(rows))):
+        cells = [line.strip("| ").split(" | ") for line in text.splitlines()]
+        assert dict(zip(cells[0], cells[2], strict=True))["training seeds"] == "3, 2"
+
+
 def test_evaluations_over_training_seeds(write_run: WriteRun, tmp_path: Path) -> None:
     values = [-10.0, -20.0, -60.0]
     for seed, value in enumerate(values):

@@ -174,6 +174,9 @@ def test_settings_are_understood_and_absent_ones_are_none(tmp_path: Path) -> Non
         (["L1_ON,Walker,1,0,1,nan"], "line 2: average_return is 'nan'"),
         (["L1_ON,Walker,1,0,1,1", "L1_ON,Walker,1,1"], "line 3: total_train_samples is None"),
         (["L1_ON,Hopper,1,0,1,1", "L1_ON,Hopper,1,1,2,1", "L1_ON,Hopper,2,0,1,1"], "in length"),
+        (["L1_ON,Hopper,1,10,2,1", "L1_ON,Hopper,1,2,1,1"], "2 of L1_ON Hopper 1 comes after 10"),
+        (2 * ["L1_ON,Hopper,1,0,1,1"], "iteration 0 of L1_ON Hopper 1 comes after 0"),
+        (["L1_ON,Walker,1,0,1,-1,5"], "line 2: more values than the 6 columns"),
     ],
 )
 def test_unusable_curves_are_refused(tmp_path: Path, rows: list[str], message: str) -> None:

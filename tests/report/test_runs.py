@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -55,6 +57,8 @@ def spoil(file: Path, before: str, after: str) -> None:
         ("versions.json", "{", "[[", "cannot read"),
         ("evaluations/ablation.csv", "bias", "offset", "no column bias"),
         ("evaluations/ablation.csv", "paper", "", "line 2: l1 is empty"),
+        ("evaluations/ablation.csv", "none,0,", "none,0,5,", "line 2: more values than the 7"),
+        ("evaluations/ablation.csv", "-1,25", "-1,25\npaper,none,0,1,stochastic,-2,25", "line 3"),
     ],
 )
 def test_a_corrupt_file_is_named(
@@ -74,6 +78,63 @@ def test_a_corrupt_file_is_named(
     else:
         (run,) = find_readable_runs([tmp_path]).runs
         assert run.final == -7.0
+
+
+def test_a_folder_that_cannot_be_looked_into_is_listed(
+    write_run: WriteRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = write_run([-9], name="open/seed_0")
+    closed = write_run([-9], name="closed/seed_0", seed=1).parent
+    scandir = os.scandir
+
+    def refusing(path: str) -> Any:  # tests may run as root, who may look everywhere
+        if Path(path) == closed:
+            raise PermissionError(13, "Permission denied", str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", refusing)
+    found = find_readable_runs([tmp_path])
+    assert [one.path for one in found.runs] == [run]
+    (error,) = found.errors
+    assert f"cannot look into {closed}: Permission denied" in str(error)
+
+
+def test_what_a_table_repeats_counts_once(write_run: WriteRun, tmp_path: Path) -> None:
+    row = {"l1": "paper", "noise": "none", "bias": 0, "gain": 1, "policy": "stochastic"}
+    table = [row | {"return_mean": -1, "episodes": 2}]
+    episodes = [row | {"episode": number, "return": -number} for number in (0, 1)]
+    tests = {"mine": 2 * table, "episodes/mine": 2 * episodes}
+    write_run([-9], evaluations=tests)
+    write_run(
+        [-9],
+        seed=1,
+        evaluations={**tests, "episodes/mine": [*episodes, episodes[0] | {"return": 3}]},
+    )
+    found = find_readable_runs([tmp_path])
+    (test,) = found.runs[0].evaluations["mine"]
+    assert test.returns == (0.0, -1.0)
+    assert not found.runs[1].evaluations
+    (error,) = found.errors
+    assert "episodes/mine.csv, line 4: what it says of L1 paper" in str(error)
+
+
+def test_an_evaluation_of_before_the_run_has_gone_on_is_left_out(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    row = {"l1": "paper", "noise": "none", "bias": 0, "gain": 1, "policy": "stochastic"}
+    row |= {"return_mean": -1, "episodes": 25}
+    tests = {name: [row] for name in ("now", "then", "damaged", "older")}
+    run = write_run([-9, -7, -5], evaluations=tests)
+    growing = write_run([-9, -7, -5], iterations=9, evaluations=tests)
+    for path in (run, growing):
+        (path / "evaluations" / "now.yaml").write_text("iterations: 3\n")
+        (path / "evaluations" / "then.yaml").write_text("iterations: 2\n")
+        (path / "evaluations" / "damaged.yaml").write_text("iterations: [\n")
+    found = find_readable_runs([tmp_path])
+    assert set(found.runs[0].evaluations) == {"now", "damaged", "older"}
+    (error,) = found.errors
+    assert str(run / "evaluations" / "then.csv") in str(error)
+    assert "made after 2 iterations, and the run has 3" in str(error)
 
 
 def test_what_cannot_be_read_is_left_out_and_the_rest_stays(

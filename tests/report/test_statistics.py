@@ -191,3 +191,16 @@ def test_recovered_needs_the_same_episodes(on: list[np.ndarray]) -> None:
         recovered([np.zeros(3)], on, [np.zeros(3)])
     with pytest.raises(ValueError, match="the same episodes of the same policies"):
         recovered([], [], [])
+
+
+@pytest.mark.parametrize(("policies", "episodes"), [(1, 1), (1, 2), (2, 1), (1, 3), (3, 1)])
+def test_one_or_two_episodes_have_no_share(policies: int, episodes: int) -> None:
+    off = [np.arange(episodes) + 0.1 * policy for policy in range(policies)]
+    found = recovered(off, [one + 5 for one in off], [one + 10 for one in off])
+    assert found.gap == pytest.approx(10)
+    if policies * episodes < 3:
+        assert found.share is None
+        assert (found.gap_interval.low, found.gap_interval.high) == (-np.inf, np.inf)
+    else:
+        assert found.share == pytest.approx(0.5)
+        assert found.gap_interval.low == pytest.approx(10)

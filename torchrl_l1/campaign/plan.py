@@ -24,10 +24,11 @@ from torchrl_l1.campaign.description import (
 from torchrl_l1.compilation import check_mode
 from torchrl_l1.envs import AnyTask
 from torchrl_l1.experiment.errors import USER_ERRORS, RunDirectoryError, message
-from torchrl_l1.experiment.evaluate import check_plants
+from torchrl_l1.experiment.evaluate import check_controllers, check_plants
 from torchrl_l1.experiment.files import bounded, path_text
 from torchrl_l1.experiment.l1_options import check_tested
 from torchrl_l1.experiment.launch import compose
+from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run_directory import RunDirectory
 from torchrl_l1.experiment.settings import SCHEMAS, RunSettings, check_known, l1_config
@@ -74,7 +75,15 @@ class PlannedRun:
         """The stages that the run has reached once it is finished."""
         return self._recipe.stages()
 
-    @property
+    def check_controllers(self, cells: Sequence[Condition]) -> None:
+        """Refuse values that a controller does not have that is to be tested.
+
+        Raises:
+            ValueError: naming the controller.
+        """
+        check_controllers(self._recipe.l1, self.task, cells)
+
+    @cached_property
     def task(self) -> AnyTask:
         """What the run is about."""
         return self._recipe.real_task()
@@ -252,6 +261,7 @@ def _add_evaluations(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
         for run in chosen:
             _check_stages(place, run, settings.matrix["stage"])
             try:
+                run.check_controllers(settings.conditions())
                 if settings.suite is None:  # of a suite, what cannot act is left out
                     check_plants(run.task, settings.conditions())
             except ValueError as error:

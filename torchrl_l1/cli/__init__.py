@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from io import TextIOWrapper
 
 from torchrl_l1._version import __version__
 
@@ -55,6 +57,7 @@ _LATER = (
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the console script. Exits with status 1 on a refused request."""
+    _print_anything()
     arguments = list(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser("torchrl-l1", description=DESCRIPTION)
     parser.add_argument("--version", action="version", version=f"torchrl-l1 {__version__}")
@@ -94,6 +97,15 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     with orderly_end():
         _dispatch(options, rest)
+
+
+def _print_anything() -> None:
+    """Let no character of a table or a path end a command because the terminal's encoding has none.
+
+    It is escaped, as Python does on standard error.
+    """
+    if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def _module(command: str) -> str:
@@ -240,7 +252,7 @@ def _recipes(copy: Sequence[str] | None) -> None:
         raise ValueError(f"--copy takes a NAME and perhaps a FILE, got {' '.join(copy)}")
     file = copy_recipe(*copy)
     command = "campaign" if copy[0] in available_campaigns() else "run"
-    print(f"{file} is yours: torchrl-l1 {command} {file}")
+    print(f"{file} is yours: torchrl-l1 {command} {shlex.quote(str(file))}")
 
 
 def _run(options: argparse.Namespace, overrides: list[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 
 from omegaconf import OmegaConf
@@ -37,4 +38,4 @@ def check_command(options: argparse.Namespace) -> None:
     if to_fix:
         print(f"{to_fix} thing{'s' * (to_fix > 1)} to fix")
         sys.exit(1)
-    print(f"nothing to fix: torchrl-l1 run {' '.join([options.recipe, *options.overrides])}")
+    print(f"nothing to fix: torchrl-l1 run {shlex.join([options.recipe, *options.overrides])}")

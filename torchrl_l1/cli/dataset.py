@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import re
+import shlex
+from pathlib import Path
 
+from torchrl_l1.campaign.plan import quoted
 from torchrl_l1.experiment.datasets import check_output, write_dataset
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.recording import QUALITIES, record
@@ -41,4 +45,7 @@ def dataset_command(options: argparse.Namespace) -> None:
         f"{len(found.episodes)} episodes, mean return {found.returns[1]:.4g}"
         + (f", {found.share:.2f} of the way from random to expert" * (found.share == found.share))
     )
-    print(f"Dataset: {name}\nTo learn from it: torchrl-l1 run offline/... dataset={name}")
+    # Hydra takes such names as they are, and others in quotes.
+    word = name if re.fullmatch(r"[\w./+-]+", name) else quoted(Path(name))
+    override = shlex.quote(f"dataset={word}")
+    print(f"Dataset: {name}\nTo learn from it: torchrl-l1 run offline/... {override}")

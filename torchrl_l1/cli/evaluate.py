@@ -22,6 +22,7 @@ from torchrl_l1.envs.rendering import (
 from torchrl_l1.experiment.checkpoints import CheckpointSettings
 from torchrl_l1.experiment.evaluate import (
     TrainedRun,
+    check_controllers,
     check_plants,
     distinct,
     evaluate_episodes,
@@ -29,7 +30,7 @@ from torchrl_l1.experiment.evaluate import (
     make_collection,
     reachable,
 )
-from torchrl_l1.experiment.files import refuse_link, write_table
+from torchrl_l1.experiment.files import make_folder, refuse_link, write_table
 from torchrl_l1.experiment.l1_options import check_tested
 from torchrl_l1.experiment.matrix import (
     SUITE_L1,
@@ -196,6 +197,14 @@ def _check_one_study(runs: Sequence[TrainedRun]) -> None:
                 f"{runs[0].path} and {trained.path} differ in more than their seed; evaluate them "
                 "one at a time"
             )
+    seeds: dict[int, TrainedRun] = {}
+    for trained in runs:
+        other = seeds.setdefault(trained.recipe.seed, trained)
+        if other is not trained:  # a copy would count twice, and make intervals narrow
+            raise ValueError(
+                f"{other.name} and {trained.name} are both of seed {trained.recipe.seed}, one "
+                "training and no two; leave one of them out"
+            )
 
 
 def _stages(runs: Sequence[TrainedRun], asked: Sequence[str]) -> list[str]:
@@ -255,12 +264,13 @@ def evaluate_command(options: argparse.Namespace) -> None:
     if options.suite:  # of which none can be left out by hand
         cells = reachable(runs[0].algorithm.task, cells)
     check_plants(runs[0].algorithm.task, cells)
+    check_controllers(runs[0].recipe.l1, runs[0].algorithm.task, cells)
     # A kept checkpoint has a folder of its own: its results are not the run's.
     folder = "_".join(filter(None, ["evaluation", runs[0].checkpoint]))
     output = Path(options.output) if options.output else runs[0].path / folder
     if not options.output:
         refuse_link(output)
-    output.mkdir(parents=True, exist_ok=True)
+    make_folder(output)
     rows, episodes = [], []
     total = len(runs) * len(cells)
     with tqdm(total=total, desc="evaluate", unit="cell", disable=None) as progress:
@@ -271,10 +281,11 @@ def evaluate_command(options: argparse.Namespace) -> None:
                 progress.update()
 
     summary = summarize(rows, episodes)
-    print(f"\n{runs[0].recipe.task}: {summary_tables(summary)}\n")
+    # Before anything is printed: what reads the output may have ended long ago.
     tables = {"evaluation": rows, "episodes": episodes, "summary": summary}
     for name, table in tables.items():
         write_table(output / f"{name}.csv", table)
+    print(f"\n{runs[0].recipe.task}: {summary_tables(summary)}\n")
     plots = _plots(summary, runs[0], output)
     print(f"Table: {', '.join(str(output / f'{name}.csv') for name in tables)}")
     print(f"Plot: {', '.join(map(str, plots))}")

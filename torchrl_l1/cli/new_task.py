@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 
 from torchrl_l1.envs import AnyTask, ExternalTask, get_task
 from torchrl_l1.envs.references import folders_of
-from torchrl_l1.experiment.files import write_atomically
+from torchrl_l1.experiment.files import write_atomically, yaml_word
 from torchrl_l1.experiment.trial import describe
 
 ALGORITHMS = ("pets", "dets", "metrpo", "mbmf")
@@ -50,7 +51,7 @@ def new_task_command(options: argparse.Namespace) -> None:
         print(line)
     file.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(file, recipe_text(options, task))
-    print(f"Recipe: {file}\nTry it for a minute: torchrl-l1 check {file}")
+    print(f"Recipe: {file}\nTry it for a minute: torchrl-l1 check {shlex.quote(str(file))}")
 
 
 def recipe_text(options: argparse.Namespace, task: AnyTask) -> str:
@@ -58,17 +59,18 @@ def recipe_text(options: argparse.Namespace, task: AnyTask) -> str:
     known = not isinstance(task, ExternalTask) or task.outcome is not None
     word = "builtin" if known else "learned"
     note = task.outcome.note if isinstance(task, ExternalTask) and task.outcome is not None else ""
-    keys = ", ".join(options.observation_keys)
+    keys = ", ".join(map(yaml_word, options.observation_keys))
+    file = shlex.quote(options.file)
     lines = [
         f"# {options.algorithm.upper()} on {options.source}:",
         *(f"#   {line}" for line in describe(task)),
-        f"# torchrl-l1 check {options.file} tries it, torchrl-l1 run {options.file} trains.",
+        f"# torchrl-l1 check {file} tries it, torchrl-l1 run {file} trains.",
         "defaults:",
         f"  - /{options.algorithm}/any@_global_",
         "  - _self_",
         "",
-        f"recipe: {Path(options.file).stem}",
-        f"task: {options.source}",
+        f"recipe: {yaml_word(Path(options.file).stem)}",
+        f"task: {yaml_word(options.source)}",
         f"dt: {options.dt:g}  # seconds of a step" if options.dt else "# dt: the environment tells",
         f"horizon: {options.horizon}  # steps of an episode"
         if options.horizon

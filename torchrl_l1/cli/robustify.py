@@ -15,7 +15,7 @@ from torchrl_l1.deployment.robust_controller import PRESETS
 from torchrl_l1.envs import DISTURBANCES, SUITES
 from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
-from torchrl_l1.experiment.files import bounded, write_atomically, write_table
+from torchrl_l1.experiment.files import bounded, make_folder, write_atomically, write_table
 from torchrl_l1.experiment.tracking import (
     MODES,
     Evaluated,
@@ -81,7 +81,7 @@ def robustify_command(options: argparse.Namespace) -> None:
     output = Path(options.output or Path("runs/robustify", _folder(options.env)))
     if output.exists() and not output.is_dir():
         raise ValueError(f"{output} is a file; choose another --output")
-    output.mkdir(parents=True, exist_ok=True)
+    make_folder(output)
     robust = robustify(
         options.env,
         options.policy,
@@ -102,9 +102,10 @@ def robustify_command(options: argparse.Namespace) -> None:
         most_steps=options.most_steps,
         seed=options.seed,
     )
-    print(f"\n{table.words}\n\n{table}\n")
+    # Before anything is printed: what reads the output may have ended long ago.
     write_table(output / "evaluation.csv", table.rows)
     write_table(output / "episodes.csv", table.episodes)
+    print(f"\n{table.words}\n\n{table}\n")
     chart = table.plot(output / "evaluation.png")
     usage = usage_lines(robust, folder)
     write_atomically(output / "README.md", page(options, robust, table, usage))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import errno
 import re
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 
 
@@ -83,12 +84,26 @@ def message(error: BaseException) -> str:
     # ``KeyError`` would quote its words like a key.
     text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
     cause = error.__cause__
-    if isinstance(error, HydraException):
+    if isinstance(error, OverrideParseException):
+        text = _of_override(text, str(error.override))
+    elif isinstance(error, HydraException):
         text = _of_hydra(text, str(cause) if isinstance(cause, OmegaConfBaseException) else "")
     elif isinstance(error, OmegaConfBaseException):
         text = _of_hydra(text, "")
     line = " ".join(text.split())
     return line if len(line) <= _LONGEST else line[:_LONGEST] + " ..."
+
+
+def _of_override(text: str, override: str) -> str:
+    """Hydra's words with the override that they are of, and without a link to its grammar."""
+    text = re.split(r"\s*See https://hydra", text)[0]
+    where = "" if override in text else f"{override}: "
+    key, _, value = override.partition("=")
+    escaped = value.replace('"', '\\"')
+    word = shlex.quote(f'{key}="{escaped}"')
+    # The directories of runs are named by overrides, so that "=" is in many a path.
+    remedy = f"; a value of such characters has quotes of its own: {word}" if value else ""
+    return f"{where}{text}{remedy}"
 
 
 def _of_hydra(text: str, cause: str) -> str:

@@ -193,9 +193,11 @@ def evaluate_episodes(
     the length of the episode. Episodes of one number start from the same reset in all conditions.
 
     Raises:
-        ValueError: for a stage that the run has not, before anything is evaluated.
+        ValueError: for a stage that the run has not, or values that a controller has not, before
+            anything is evaluated.
     """
     check_plants(trained.algorithm.task, cells)
+    check_controllers(trained.recipe.l1, trained.algorithm.task, cells)
     for cell in [replace(cell, stage=trained.stage(cell.stage)) for cell in cells]:
         collection = make_collection(trained, cell, episodes)
         data = collection.evaluate(seed, deterministic=cell.policy == "deterministic")
@@ -234,6 +236,24 @@ def check_plants(task: AnyTask, cells: Sequence[Condition]) -> None:
         task.check_disturbances([n for n in changed if DISTURBANCES[n].acts_on == "plant"])
 
 
+def check_controllers(own: L1Settings, task: AnyTask, cells: Sequence[Condition]) -> None:
+    """Refuse values that a controller does not have, as ``alpha`` where a filter needs none.
+
+    Args:
+        own: the controller of the run.
+        task: its task.
+        cells: what it is to be tested in.
+
+    Raises:
+        ValueError: naming the controller.
+    """
+    for cell in {cell.controller: cell for cell in cells if cell.l1 != ORACLE}.values():
+        try:
+            l1_config(_tested_l1(own, task, cell), task)
+        except ValueError as error:
+            raise ValueError(f"L1 {cell.controller}: {error}") from error
+
+
 def reachable(task: AnyTask, cells: Sequence[Condition]) -> list[Condition]:
     """Those conditions of a suite that can act on a task."""
     found = []
@@ -251,15 +271,16 @@ def episodes_file(table: Path) -> Path:
 
 def make_collection(trained: TrainedRun, cell: Condition, episodes: int) -> Collection:
     """The environments of one condition around the frozen policy and model."""
-    settings = None if cell.l1 == ORACLE else _tested_l1(trained, cell)
+    task = trained.algorithm.task
+    settings = None if cell.l1 == ORACLE else _tested_l1(trained.recipe.l1, task, cell)
     disturbances = {DISTURBANCES[name].setting: value for name, value in cell.disturbances.items()}
     perturbation = Perturbation(**group_setting("noise", cell.noise), **disturbances)
     return Collection(
-        trained.algorithm.task,
+        task,
         episodes,
         trained.algorithm.policies[trained.stage(cell.stage)],
         trained.algorithm.acting_dynamics,
-        ORACLE if settings is None else l1_config(settings, trained.algorithm.task),
+        ORACLE if settings is None else l1_config(settings, task),
         perturbation,
         trained.recipe.horizon,
     )
@@ -276,18 +297,18 @@ def _is_own(trained: TrainedRun, cell: Condition) -> bool:
     """Whether the controller of a test is the one that the run was trained with."""
     if cell.l1 == ORACLE:
         return False
-    return same_controller(_tested_l1(trained, cell), trained.recipe.l1, trained.algorithm.task)
+    own, task = trained.recipe.l1, trained.algorithm.task
+    return same_controller(_tested_l1(own, task, cell), own, task)
 
 
-def _tested_l1(trained: TrainedRun, cell: Condition) -> L1Settings:
+def _tested_l1(own: L1Settings, task: AnyTask, cell: Condition) -> L1Settings:
     """The controller of a test.
 
     Where the option is the one that the run was trained with, however it was tuned, it is the
     run's own. Any other is as shipped, with the run's epsilon. What the condition sets counts
     for either.
     """
-    own = trained.recipe.l1
-    if cell.l1 == closest_option(own, trained.algorithm.task):
+    if cell.l1 == closest_option(own, task):
         settings = own
     else:
         settings = replace(l1_option(cell.l1), epsilon=own.epsilon)

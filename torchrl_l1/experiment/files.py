@@ -65,10 +65,15 @@ def path_text(text: str) -> str:
 def bounded_overrides(dirname: str) -> str:
     """Hydra's name for a list of overrides, with the shortest of them and a digest if it is long.
 
+    A path among them leads down only: ``..`` would take away what stands before it in the name.
+
     Examples:
         >>> bounded_overrides("l1=off,noise=action")
         'l1=off,noise=action'
+        >>> bounded_overrides("cem.horizon=5,dataset=../../data/mine.npz")
+        'cem.horizon=5,dataset=../__/data/mine.npz'
     """
+    dirname = re.sub(r"/\.\.(?=/|$)", "/__", dirname)
     parts = [
         path_text(part) if part.startswith("task=") else part
         for part in re.split(r",(?=[\w+~][\w.@/+~-]*=)", dirname)
@@ -96,6 +101,21 @@ def refuse_link(path: Path) -> None:
         raise RunDirectoryError(
             f"{path} is a symbolic link, which is not followed for writing; remove the link"
         )
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, and find out before hours of work whether results can be written to it.
+
+    Raises:
+        OSError: with the name of the folder.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    probe = folder / ".writable"
+    try:
+        write_atomically(probe, "")
+        probe.unlink()
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(folder)) from error
 
 
 @contextmanager
@@ -225,6 +245,18 @@ _PlainLoader.add_implicit_resolver(
 # References, tags and interpolations are OmegaConf's to judge; libyaml's nesting has no bounds.
 _NOT_PLAIN = re.compile(r"[&*!\r\x85\u2028\u2029]|\$\{|^[ \t?:-]{60}|^---|^\.\.\.|^%", re.MULTILINE)
 _MOST_BRACKETS = 200
+
+
+def yaml_word(text: str) -> str:
+    """A text as a value in a YAML file that is written by hand, quoted where it needs be.
+
+    Examples:
+        >>> print(yaml_word("envs.py:make_env"), yaml_word("a #1"), yaml_word("1e3"))
+        envs.py:make_env 'a #1' '1e3'
+    """
+    if re.fullmatch(r"(?!(?:true|false|null)$)[A-Za-z_/][\w.+/:@-]*(?<!:)", text, re.IGNORECASE):
+        return text
+    return "'" + text.replace("'", "''") + "'"
 
 
 def settings_content(file: Path) -> Any:

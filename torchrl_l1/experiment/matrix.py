@@ -265,8 +265,13 @@ def check_values(values: Mapping[str, Sequence[Any]], prefix: str = "") -> None:
                 raise ValueError(
                     f"unknown {axis.name} {value!r}; there are {', '.join(axis.choices)}"
                 )
-            if axis.name in DISTURBANCES and not math.isfinite(value):
-                raise ValueError(f"{prefix}{axis.name} must be finite, got {value}")
+            if axis.name in DISTURBANCES:
+                if not math.isfinite(value):
+                    raise ValueError(f"{prefix}{axis.name} must be finite, got {value}")
+                try:
+                    DISTURBANCES[axis.name].check(value)
+                except ValueError as error:
+                    raise ValueError(f"{prefix}{axis.name}: {error}") from None
     check_tuning(values["epsilon"], values["alpha"], prefix)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from difflib import get_close_matches
 from pathlib import Path
@@ -11,6 +12,7 @@ from omegaconf import OmegaConf
 
 import torchrl_l1
 from torchrl_l1.experiment.errors import RecipeError
+from torchrl_l1.experiment.files import write_atomically, yaml_word
 
 # Folders beside the recipes: their groups, and matrices of runs.
 _NOT_RECIPES = ("shared", "campaigns")
@@ -103,12 +105,12 @@ def copy_recipe(name: str, file: str | None = None) -> Path:
     if copy.suffix != ".yaml" or not copy.stem.strip("."):
         raise RecipeError(f"the copy's name must end in .yaml, got {copy}")
     text = source.read_text(encoding="utf-8")
-    text = re.sub(r"(?m)^recipe: \S+$", f"recipe: {copy.stem}", text)
-    try:
-        with copy.open("x", encoding="utf-8") as handle:
-            handle.write(text)
-    except FileExistsError:
-        raise RecipeError(f"{copy} is there already; give another FILE") from None
+    named = f"recipe: {yaml_word(copy.stem)}"
+    text = re.sub(r"(?m)^recipe: \S+$", lambda _: named, text)
+    if os.path.lexists(copy):
+        raise RecipeError(f"{copy} is there already; give another FILE")
+    # A part of a campaign may be a campaign, too.
+    write_atomically(copy, text)
     return copy
 
 

@@ -457,9 +457,11 @@ def same_code_in(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
 def run_directories(folder: Path) -> Iterator[tuple[Path, dict[str, Any] | RunDirectoryError]]:
     """Every run directory in or below a folder, with its configuration or why that is unreadable.
 
-    Folders come in alphabetical order; hidden ones, and those that are links, are left out.
+    Folders come in alphabetical order; hidden ones, and those that are links, are left out. One
+    that cannot be looked into counts as a run directory that is unreadable.
     """
-    for path, below, files in os.walk(folder):
+    closed: list[OSError] = []
+    for path, below, files in os.walk(folder, onerror=closed.append):
         below[:] = sorted(name for name in below if not name.startswith("."))
         if "config.yaml" not in files:
             continue
@@ -472,6 +474,8 @@ def run_directories(folder: Path) -> Iterator[tuple[Path, dict[str, Any] | RunDi
         if isinstance(config, RunDirectoryError) or ("task" in config and "seed" in config):
             below.clear()
             yield Path(path), config
+    for refusal in closed:
+        yield Path(refusal.filename), RunDirectoryError(f"cannot look into {message(refusal)}")
 
 
 def read_config(file: Path) -> dict[str, Any]:

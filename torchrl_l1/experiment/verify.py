@@ -155,7 +155,7 @@ def verify_command(path: str, tolerance: float) -> bool:
     width = max(len(name) for name, _ in results)
     for name, error in results:
         print(f"{name:<{width}}  {error:.3e}  {'ok' if error <= tolerance else 'TOO LARGE'}")
-    failed = sum(error > tolerance for _, error in results)
+    failed = sum(not error <= tolerance for _, error in results)
     print(
         f"{len(results) - failed} of {len(results)} traces within {tolerance:g} "
         f"(largest error {max(error for _, error in results):.3e})"

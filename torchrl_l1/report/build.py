@@ -6,6 +6,7 @@ import argparse
 import gc
 import math
 import os
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -137,12 +138,12 @@ def _run_rows(every: Sequence[Study]) -> list[dict[str, Any]]:
 
 
 def _command(folders: Sequence[Path], output: Path, reference_curves: Path | None) -> str:
-    words = ["torchrl-l1 report", *map(str, folders)]
+    words = ["torchrl-l1", "report", *map(str, folders)]
     if output != folders[0] / "report":
-        words.append(f"--output {output}")
+        words += ["--output", str(output)]
     if reference_curves is not None:
-        words.append(f"--reference-curves {reference_curves}")
-    return " ".join(words)
+        words += ["--reference-curves", str(reference_curves)]
+    return shlex.join(words)
 
 
 @dataclass(frozen=True)
@@ -207,7 +208,7 @@ def _read_campaign(folder: Path, runs: Sequence[Run]) -> CampaignState:
     return CampaignState(
         name,
         str(content.get("description", "")),
-        f"torchrl-l1 campaign {given} --output {folder}",
+        shlex.join(["torchrl-l1", "campaign", str(given), "--output", str(folder)]),
         expected,
         sum(run.finished for run in mine),
         sum(not run.finished for run in mine),

@@ -385,7 +385,7 @@ def evaluation_table(rows: Sequence[Row]) -> str:
     lines = []
     for _, found in grouped(rows, keys, "l1"):
         first = next(iter(found.values()))
-        line = _place(first, names) | {"training seeds": str(first["training_seeds"])}
+        line = _place(first, names) | {"training seeds": _seeds(found)}
         line |= {arm_label(l1): return_text(found.get(l1)) for l1 in tested}
         on = [l1 for l1 in tested if l1 != BASELINE]
         line |= {f"{arm_label(l1)} less off": difference_text(found.get(l1, {})) for l1 in on}
@@ -393,6 +393,12 @@ def evaluation_table(rows: Sequence[Row]) -> str:
         line |= {f"paper, L1 {l1}": paper_text(found.get(l1, {}), notes) for l1 in tested}
         lines.append(line)
     return notes.below(markdown(lines))
+
+
+def _seeds(tests: Mapping[str, Row]) -> str:
+    """How many training seeds there are; of each test, in their order, where that differs."""
+    numbers = [str(row["training_seeds"]) for row in tests.values()]
+    return ", ".join(numbers if len(set(numbers)) > 1 else numbers[:1])
 
 
 def tuning_table(rows: Sequence[Row]) -> str:
@@ -448,9 +454,7 @@ def ablation_table(rows: Sequence[Row]) -> str:
     for cell, found in grouped(rows, keys, "phase"):
         line = dict(zip(keys, cell, strict=True))
         line |= {where: return_text(found.get(where)) for where in L1_IN}
-        line["training seeds"] = ", ".join(
-            sorted({str(row["training_seeds"]) for row in found.values()})
-        )
+        line["training seeds"] = _seeds(found)
         line |= {f"paper, {where}": paper_text(found.get(where, {}), notes) for where in L1_IN}
         lines.append(line)
     return notes.below(markdown(lines))

@@ -28,6 +28,7 @@ class Page:
         self.folder = folder
         self.name = ""
         self._blocks: list[str] = ["# Report"]
+        self._taken: set[str] = set()
 
     def part(self, name: str) -> Page:
         """The same page, to be continued under a name.
@@ -36,12 +37,24 @@ class Page:
             name: comes first in headings, captions and names of files; nothing does if empty.
         """
         part = Page(self.folder)
-        part.name, part._blocks = name, self._blocks
+        part.name, part._blocks, part._taken = name, self._blocks, self._taken
         return part
 
     def file(self, *words: str, suffix: str = ".png") -> Path:
-        """Where a file of this part goes; a long name is cut, and ends in its digest."""
-        return self.folder / f"{bounded(slug((self.name, *words)))}{suffix}"
+        """Where a further file of this part goes; a long name is cut, and ends in its digest.
+
+        Words that differ in nothing but signs, as -0.5 and 0.5, have names with a number.
+        """
+        return self._free(slug((self.name, *words)), suffix)
+
+    def _free(self, name: str, suffix: str) -> Path:
+        """A name that no other file of the page has, also where capitals make no difference."""
+        number, file = 1, f"{bounded(name)}{suffix}"
+        while file.lower() in self._taken:
+            number += 1
+            file = f"{bounded(name)}_{number}{suffix}"
+        self._taken.add(file.lower())
+        return self.folder / file
 
     def heading(self, text: str, how_to_read: str) -> None:
         """Begin a section with a sentence on how to read it."""
@@ -53,9 +66,12 @@ class Page:
         self._blocks += [block for block in blocks if block]
 
     def csv(self, name: str, rows: Sequence[Row]) -> None:
-        """Write a table in full precision and name it."""
+        """Write a table in full precision and name it; one that is called like another by number.
+
+        So may an evaluation be called ``training``.
+        """
         prefix = f"{slug((self.name,))}_" if self.name else ""
-        file = self.folder / f"{bounded(prefix + name)}.csv"
+        file = self._free(prefix + name, ".csv")
         write_table(file, [{key: _cell(value) for key, value in row.items()} for row in rows])
         self.text(f"All columns: [{file.name}](./{file.name}).")
 
@@ -66,7 +82,7 @@ class Page:
 
     def render(self) -> str:
         """The Markdown."""
-        return "\n\n".join(self._blocks) + "\n"
+        return _writable("\n\n".join(self._blocks) + "\n")
 
 
 def plain(text: object) -> str:
@@ -94,8 +110,14 @@ def code(text: object) -> str:
     return f"`{line.replace('`', chr(39)).replace('|', chr(166))}`"
 
 
+def _writable(text: str) -> str:
+    """A text with the bytes of paths escaped that are no UTF-8."""
+    return text.encode(errors="backslashreplace").decode()
+
+
 def _cell(value: object) -> object:
     """A value of a CSV: text that a spreadsheet would take for a formula is quoted."""
+    value = _writable(value) if isinstance(value, str) else value
     if isinstance(value, str) and re.match(r"[=+@\t\r]|-(?![\d.])", value):
         return f"'{value}"
     return value

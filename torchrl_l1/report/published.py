@@ -140,15 +140,23 @@ class ReferenceCurves:
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if a column is missing, a value is empty or no number, a setting is unknown,
-            or the seeds of a setting differ in length.
+            the seeds of a setting differ in length, or their iterations are not in order.
     """
 
     def __init__(self, path: Path) -> None:
         if not path.is_file():
             raise FileNotFoundError(f"no reference curves at {path}")
         runs: dict[tuple[str, str], dict[str, list[tuple[float, float]]]] = {}
-        for row in numeric_rows(path, CURVE_COLUMNS[-2:], CURVE_COLUMNS[:-2]):
+        last: dict[tuple[str, str, str], float] = {}
+        for row in numeric_rows(path, CURVE_COLUMNS[-3:], CURVE_COLUMNS[:-3]):
             seeds = runs.setdefault((row["arm"], row["setting"]), {})
+            whose, iteration = (row["arm"], row["setting"], row["seed"]), row["iteration"]
+            if iteration <= last.get(whose, -np.inf):
+                raise ValueError(
+                    f"{path}: iteration {iteration:g} of {' '.join(whose)} comes after "
+                    f"{last[whose]:g}; sort the rows of each seed by the number, each once"
+                )
+            last[whose] = iteration
             steps = row["total_train_samples"] * _STEPS_PER_TRAINING_SAMPLE
             seeds.setdefault(row["seed"], []).append((steps, row["average_return"]))
         self._curves: dict[tuple[str, str, bool, str], Curves] = {}

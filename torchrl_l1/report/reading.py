@@ -114,12 +114,18 @@ def read_evaluations(file: Path) -> list[Evaluation]:
     """The rows of an evaluation, with the returns of single episodes where these are beside it.
 
     Disturbances that it has no column of are neutral.
+
+    Raises:
+        RunDirectoryError: if a file cannot be read, or says two things of one condition.
     """
-    rows = _condition_rows(file, ("return_mean", "episodes"), ("own_l1", SWITCH_RATE, "steps_mean"))
+    optional = ("own_l1", SWITCH_RATE, "steps_mean")
+    rows = _each_once(file, _condition_rows(file, ("return_mean", "episodes"), optional))
     singly: dict[tuple[Any, ...], list[float]] = {}
     episodes = episodes_file(file)
-    for row in _condition_rows(episodes, ("return",)) if episodes.exists() else ():
-        singly.setdefault(_condition_key(row), []).append(row["return"])
+    if episodes.exists():
+        # The episodes of older tables may have no numbers.
+        for row in _each_once(episodes, _condition_rows(episodes, ("return",), ("episode",))):
+            singly.setdefault(_condition_key(row), []).append(row["return"])
     return [
         Evaluation(
             l1=row["l1"],
@@ -138,6 +144,20 @@ def read_evaluations(file: Path) -> list[Evaluation]:
         )
         for row in rows
     ]
+
+
+def _each_once(file: Path, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows, of those that are equal the first: a repetition is no further training seed."""
+    found: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for index, row in enumerate(rows):
+        number = row.get("episode", 0.0)
+        key = (*_condition_key(row), index if math.isnan(number) else (number,))
+        if str(found.setdefault(key, row)) != str(row):  # NaN is equal to itself here
+            raise RunDirectoryError(
+                f"{file}, line {index + 2}: what it says of L1 {row['l1']} under these conditions "
+                "is not what a line before it says; evaluate the run again"
+            )
+    return list(found.values())
 
 
 def _condition_rows(
@@ -233,18 +253,24 @@ def numeric_rows(
         if_any: columns that are left out if absent or empty, else of finite numbers.
 
     Raises:
-        ValueError: if the file cannot be read, a column is missing, or a cell holds something
-            else; the message names file and line.
+        ValueError: if the file cannot be read, a column is missing, a line has more values than
+            there are columns, or a cell holds something else; the message names file and line.
     """
     try:
         reader = csv.reader(io.StringIO(read_text(file, _MOST_BYTES), newline=""), strict=True)
         # The last of equal names counts.
-        place = {name: index for index, name in enumerate(next(reader, []))}
+        header = next(reader, [])
+        columns = len(header)
+        place = {name: index for index, name in enumerate(header)}
         missing = [k for k in (*words, *numbers) if k not in place]
         if missing:
             raise ValueError(f"{file} has no column {', '.join(missing)}")
         rows = [row for row in reader if row]
         most = max(map(len, rows), default=0)
+        for line, row in enumerate(rows, start=2) if most > columns else ():
+            # As of a comma in place of a decimal point, which moves all behind it.
+            if any(row[columns:]):
+                raise ValueError(f"{file}, line {line}: more values than the {columns} columns")
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"cannot read {file}: {error}") from error
 

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from torchrl_l1.algorithms.facts import MEASURING, WINDOW
+from torchrl_l1.campaign.description import load_yaml
 from torchrl_l1.experiment.errors import RunDirectoryError, message
 from torchrl_l1.experiment.files import read_text
 from torchrl_l1.experiment.run_directory import RunDirectory, run_directories
@@ -203,10 +204,28 @@ def find_readable_runs(folders: Sequence[Path]) -> Findings:
     return found
 
 
-def _read_table(file: Path) -> list[Evaluation]:
-    """An evaluation whose name is a word, as campaigns ask for: it goes into names and headings."""
+def _read_table(file: Path, iterations: int | None) -> list[Evaluation]:
+    """An evaluation whose name is a word, as campaigns ask for: it goes into names and headings.
+
+    One that was made before a run has gone on is of another policy than the run's last.
+
+    Args:
+        file: the table.
+        iterations: of the run; of one that is not finished ``None`` will do: its tables enter
+            nothing.
+    """
     if not re.fullmatch(r"[A-Za-z0-9_.+-]{1,100}", file.stem):
         raise RunDirectoryError(f"cannot use {file}: its name is no word of at most 100 letters")
+    described = file.with_suffix(".yaml")
+    try:
+        made_after = load_yaml(described)["iterations"] if described.exists() else iterations
+    except (OSError, ValueError, LookupError, TypeError):
+        made_after = iterations  # it is the table that counts
+    if isinstance(made_after, int) and iterations not in (None, made_after):
+        raise RunDirectoryError(
+            f"{file} was made after {made_after} iterations, and the run has {iterations}; its "
+            "campaign makes it again"
+        )
     return read_evaluations(file)
 
 
@@ -248,8 +267,9 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
 
     path = directory.path
     tables = sorted((path / "evaluations").glob("*.csv"))
+    whole = iterations if iterations == identity.outer_iterations else None
     evaluations: dict[str, list[Evaluation]] = {
-        file.stem: readable(partial(_read_table, file), []) for file in tables
+        file.stem: readable(partial(_read_table, file, whole), []) for file in tables
     }
     return Run(
         path,

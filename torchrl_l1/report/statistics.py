@@ -169,6 +169,8 @@ def recovered(
     with replacement, and within each one its episodes; what is drawn counts for all three. Every
     policy has the same weight. The resampling has a fixed seed.
 
+    With fewer than three episodes in all that of the gap has no bounds, and there is no share.
+
     Where the disturbance does a policy good, the gap is negative, and 1 still means that all of
     it is undone.
 
@@ -197,7 +199,9 @@ def recovered(
         for returns in (off, on, oracle)
     )
     gain, gap = gain - plain, gap - plain
-    gap_interval = _percentiles(gap[1:])
+    # Resamples of one or two values know nothing of the others that there might have been.
+    known = sum(sizes) >= MIN_SAMPLES
+    gap_interval = _percentiles(gap[1:]) if known else Interval(-np.inf, np.inf)
     found = Recovery(float(gap[0]), gap_interval, None, None, len(sizes))
     if gap_interval.low <= 0 <= gap_interval.high:
         return found
