@@ -213,6 +213,22 @@ def test_models_of_other_spaces_are_refused(env, observation, action, message):
         load_policy(SimpleNamespace(policy=policy, predict=len), env)
 
 
+@pytest.mark.parametrize(("bound", "warned"), [(3.0, False), (1.0, True)])
+def test_other_bounds_than_the_environments_are_told(env, bound, warned):
+    policy = SimpleNamespace(
+        squash_output=True,
+        observation_space=spaces.Box(-np.inf, np.inf, (4,)),
+        action_space=spaces.Box(-bound, bound, (1,)),
+        set_training_mode=lambda mode: None,
+        _predict=lambda observation, deterministic: observation[..., :1],
+    )
+    model = SimpleNamespace(policy=policy, predict=len)
+    message = r"trained with actions from \[-1.0\] to \[1.0\], the environment takes \[-3.0\] to"
+    with pytest.warns(UserWarning, match=message) if warned else warnings.catch_warnings():
+        found = load_policy(model, env)
+    torch.testing.assert_close(actions(found, OBSERVATION), bound * OBSERVATION[:, :1])
+
+
 def test_normalization_of_another_policy_is_refused(env):
     with pytest.raises(ValueError, match="belongs to policies of Stable-Baselines3"):
         load_policy(balance, env, normalization="statistics.pkl")

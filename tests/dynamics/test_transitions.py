@@ -16,7 +16,13 @@ from torchrl.collectors.utils import split_trajectories
 from torchrl.data import LazyTensorStorage, ListStorage, ReplayBuffer
 from torchrl.envs import GymEnv, SerialEnv, StepCounter, TransformedEnv
 
-from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, fit_ensemble, read_transitions
+from torchrl_l1.dynamics import (
+    EnsembleDynamics,
+    FitConfig,
+    fit_dynamics,
+    fit_ensemble,
+    read_transitions,
+)
 
 
 def line(*lengths: int, offset: float = 0.0) -> TensorDict:
@@ -336,3 +342,17 @@ def test_what_a_batched_mujoco_environment_collects() -> None:
     assert data.shape == (2, 100) and data["observation"].dtype is torch.float64
     assert len(read.data) == 200 and read.data["observation"].dtype is torch.float32
     assert int((~read.joined).sum()) == int(data["next", "done"][:, :-1].sum()) + 2
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e3, 5e6])
+def test_changes_lost_in_the_digits_of_large_values_are_told(offset: float) -> None:
+    torch.manual_seed(0)
+    x, u = torch.randn(200, 2, dtype=torch.float64), torch.randn(200, 1, dtype=torch.float64)
+    after = 0.9 * x + 0.1 * u
+    x, after = (value + torch.tensor([0.0, offset]) for value in (x, after))
+    data = TensorDict({"seen": x, "action": u, ("next", "seen"): after}, [200])
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        fit_dynamics(data, observation_key="seen", hidden=(8,), max_epochs=1)
+    digits = [str(one.message) for one in told if "per step" in str(one.message)]
+    assert [message[:22] for message in digits] == ["'seen'[1] changes by 0"] * (offset == 5e6)

@@ -290,8 +290,10 @@ def load_policy(
         return found
     if not callable(found):
         raise ValueError(f"a {type(found).__name__} is no policy; policies are {_FORMS}")
-    observation = env.full_observation_spec["observation"]
-    return FunctionPolicy(found, observation, env.full_action_spec["action"])
+    action = env.full_action_spec["action"]
+    if isinstance(found, StableBaselinesPolicy):
+        _warn_of_bounds(found, action)
+    return FunctionPolicy(found, env.full_observation_spec["observation"], action)
 
 
 def _check_keys(policy: TensorDictModuleBase, env: EnvBase) -> None:
@@ -413,6 +415,25 @@ def _check_spaces(policy: Any) -> None:
                 f"the policy {what} {space}: it must read and give vectors of numbers, each a Box "
                 "of one dimension; wrap what joins or splits them as a function of the observation"
             )
+
+
+def _warn_of_bounds(policy: StableBaselinesPolicy, action: TensorSpec) -> None:
+    """Say that a policy acts in other units than the environment, as far as bounds tell."""
+    if not isinstance(action, Bounded) or policy.low.shape != action.shape[-1:]:
+        return
+    theirs = action.space.low, action.space.high
+    ours = policy.low, policy.high
+    pairs = zip(ours, theirs, strict=True)
+    if not all(
+        _close(own.expand_as(there), there) for own, there in pairs if there.isfinite().all()
+    ):
+        row = [side.reshape(-1, side.shape[-1])[0].tolist() for side in theirs]
+        warnings.warn(
+            f"the policy was trained with actions from {ours[0].tolist()} to {ours[1].tolist()}, "
+            f"the environment takes {row[0]} to {row[1]}: if a wrapper such as RescaleAction was "
+            "between them, let the function that makes the environment add it",
+            stacklevel=3,
+        )
 
 
 def _moments(normalize: Any) -> tuple[Tensor, Tensor, float, float] | None:

@@ -41,6 +41,28 @@ class Transitions:
     joined: Tensor
     dropped: int
 
+    def warn_of_rounding(self, observation_key: NestedKey = "observation") -> None:
+        """Warn of entries that change by little more than their type tells apart at such values.
+
+        Args:
+            observation_key: what the observation is called where it comes from.
+
+        Warns:
+            UserWarning: naming entries whose changes vary by less than 20 steps of the type. What
+                varies by less than 0.0001 counts as constant, as it does for the model.
+        """
+        before, after = self.data["observation"], self.data["next", "observation"]
+        spread = (after - before).std(0, correction=0)
+        step = before.abs().amax(0) * torch.finfo(before.dtype).eps
+        for entry in ((spread > 1e-4) & (spread < 20 * step)).nonzero().squeeze(-1).tolist():
+            kind = str(before.dtype).removeprefix("torch.")
+            warnings.warn(
+                f"{_name(observation_key)}[{entry}] changes by {spread[entry]:.2g} per step, and "
+                f"numbers of {kind} as large as its values are {step[entry]:.2g} apart: subtract "
+                "an offset first",
+                stacklevel=3,
+            )
+
 
 def read_transitions(
     data: Data,
