@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import matplotlib.image
 import pytest
+import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_l1.algorithms import MBMF
@@ -137,6 +138,16 @@ def test_cells_share_their_random_numbers_and_see_their_disturbance(tiny_recipe:
     assert first == again
     assert biased < first
     assert noisy not in (first, biased)
+
+
+def test_settings_that_look_like_interpolations_are_what_they_were(tiny_recipe: Recipe) -> None:
+    words = ["a ${x}", r"b \${y} \\${z}", "${oc.env:HOME}", r"\d"]
+    trained = run(tiny_recipe())
+    file = trained / "config.yaml"
+    config = yaml.safe_load(file.read_text())
+    config["wandb"]["tags"] = words
+    file.write_text(yaml.safe_dump(config))
+    assert load_run(trained).recipe.wandb.tags == words
 
 
 def test_epsilon_zero_moves_the_operating_point_in_every_step(tiny_recipe: Recipe) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -117,12 +118,23 @@ def _recipe(directory: RunDirectory) -> RunSettings:
     stored = read_config(directory.config_file)
     try:
         schema = OmegaConf.structured(schema_of(stored))
-        recipe = OmegaConf.to_object(OmegaConf.merge(schema, stored))
+        recipe = OmegaConf.to_object(OmegaConf.merge(schema, _literal(stored)))
         assert isinstance(recipe, RunSettings)
         return recipe
     # Whatever stands in a damaged file: OmegaConf and dataclasses have no common error.
     except Exception as error:
         raise RunDirectoryError(f"cannot use {directory.config_file}: {message(error)}") from error
+
+
+def _literal(value: Any) -> Any:
+    """Settings as OmegaConf leaves them as they are: interpolations were resolved for the run."""
+    if isinstance(value, dict):
+        return {key: _literal(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_literal(inner) for inner in value]
+    if isinstance(value, str):
+        return re.sub(r"(\\*)\$\{", r"\1\1\\${", value)
+    return value
 
 
 def _measure_residuals(algorithm: Algorithm, buffer: dict[str, Any], recipe: RunSettings) -> None:
