@@ -356,3 +356,20 @@ def test_changes_lost_in_the_digits_of_large_values_are_told(offset: float) -> N
         fit_dynamics(data, observation_key="seen", hidden=(8,), max_epochs=1)
     digits = [str(one.message) for one in told if "per step" in str(one.message)]
     assert [message[:22] for message in digits] == ["'seen'[1] changes by 0"] * (offset == 5e6)
+
+
+def test_inputs_that_never_vary_are_ignored_and_told() -> None:
+    torch.manual_seed(0)
+    x, u = torch.randn(500, 3), torch.randn(500, 2)
+    x[:, 2], u[:, 1] = 5.0, 0.3
+    change = torch.cat([0.1 * u[:, :1] - 0.1 * x[:, :2], torch.zeros(500, 1)], -1)
+    data = TensorDict({"observation": x, "action": u, ("next", "observation"): x + change}, [500])
+    with pytest.warns(UserWarning, match=r"'action'\[1\] never varies: what it does is not in"):
+        model = fit_dynamics(data, hidden=(64,))
+    seen, other = x[:5], x[:5] + torch.tensor([0.0, 0.0, 2.0])
+    pushed = u[:5] + torch.tensor([0.0, 0.7])
+    expected, gain = model.value_and_jacobian(seen, u[:5])
+    for observation, action in ((other, u[:5]), (seen, pushed), (other, pushed)):
+        torch.testing.assert_close(model.value_and_jacobian(observation, action), (expected, gain))
+    torch.testing.assert_close(gain[:, :2, 0], torch.full((5, 2), 0.1), rtol=0.0, atol=0.05)
+    assert (gain[..., 1] == 0).all()

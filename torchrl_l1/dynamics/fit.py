@@ -305,8 +305,8 @@ def fit_dynamics(
         a table.
 
     Warns:
-        UserWarning: if rows of the data are left out, changes are lost in the digits of large
-            values, or the model is too poor for L1 to be of use.
+        UserWarning: if rows of the data are left out, an entry of the action never varies, changes
+            are lost in the digits of large values, or the model is too poor for L1 to be of use.
 
     Raises:
         KeyError: if the data lack a key.
@@ -338,7 +338,7 @@ def fit_dynamics(
         raise ValueError("cannot fit: the data hold no transitions; collect some first")
     n, m = (transitions.data[key].shape[-1] for key in ("observation", "action"))
     entry_names(n, names, units)
-    transitions.warn_of_rounding(observation_key)
+    transitions.warn_of_gaps(*keys)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         dynamics = make_dynamics(n, m, **{"hidden": (128, 128), **settings}).to(here)

@@ -115,11 +115,17 @@ class EnsembleDynamics(nn.Module):
         self.elites = torch.tensor(chosen, device=self.elites.device)
 
     def fit_statistics(self, observation: Tensor, action: Tensor, change: Tensor) -> None:
-        """Set the normalisers and the data box from samples ``(N, n)``, ``(N, m)``, ``(N, n)``."""
+        """Set the normalisers and the data box from samples ``(N, n)``, ``(N, m)``, ``(N, n)``.
+
+        Inputs that never vary in them are ignored, whatever they are later: nothing can be learned
+        of what they do, and their weights stay as they were drawn.
+        """
         self.observation_normalizer.fit(observation)
         self.action_normalizer.fit(action)
         self.change_normalizer.fit(change)
         self.box.fit(observation)
+        self.observation_normalizer.ignore(self.box.fixed)
+        self.action_normalizer.ignore((action == action[:1]).all(0))
 
     def normalize_inputs(self, observation: Tensor, action: Tensor) -> Tensor:
         """Network inputs ``(..., n + m)`` from raw observations and actions."""

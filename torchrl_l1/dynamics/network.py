@@ -289,10 +289,6 @@ def _fold_inputs(dynamics: EnsembleDynamics, weights: list[Tensor], biases: list
     std = torch.cat([part.std for part in parts]).double()
     width = weights[0].shape[1]
     weights[0] = weights[0] / std[:width, None]
-    # Of an entry that never varied nothing was learned. Its weights are large, for the floor of its
-    # standard deviation is small, and what would be left of their product and of the bias that
-    # cancels it is rounding.
-    weights[0][:, : dynamics.observation_dim][:, dynamics.box.fixed] = 0
     biases[0] = biases[0] - mean[:width] @ weights[0]
     if not dynamics.affine_in_action:
         return

@@ -60,6 +60,15 @@ class Normalizer(nn.Module):
         self.mean.copy_(mean)
         self.std.copy_(std.clamp_min(self.std_floor))
 
+    @torch.no_grad()
+    def ignore(self, columns: Tensor) -> None:
+        """Normalise what is in some columns to zero, until the next fit.
+
+        Args:
+            columns: which, ``(dim,)`` bool. Their standard deviation becomes infinite.
+        """
+        self.std.masked_fill_(columns, torch.inf)
+
     def normalize(self, data: Tensor) -> Tensor:
         """Raw ``(..., dim)`` to normalised ``(..., dim)``."""
         return (data - self.mean) / self.std

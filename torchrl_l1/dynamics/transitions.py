@@ -41,16 +41,28 @@ class Transitions:
     joined: Tensor
     dropped: int
 
-    def warn_of_rounding(self, observation_key: NestedKey = "observation") -> None:
-        """Warn of entries that change by little more than their type tells apart at such values.
+    def warn_of_gaps(
+        self, observation_key: NestedKey = "observation", action_key: NestedKey = "action"
+    ) -> None:
+        """Warn of what no model can be told by the data.
 
         Args:
             observation_key: what the observation is called where it comes from.
+            action_key: what the action is called there.
 
         Warns:
-            UserWarning: naming entries whose changes vary by less than 20 steps of the type. What
-                varies by less than 0.0001 counts as constant, as it does for the model.
+            UserWarning: naming entries of the action that never vary, and entries of the
+                observation whose changes vary by less than 20 steps of their type. What varies by
+                less than 0.0001 counts as constant, as it does for the model.
         """
+        action = self.data["action"]
+        for entry in (action == action[:1]).all(0).nonzero().squeeze(-1).tolist():
+            warnings.warn(
+                f"{_name(action_key)}[{entry}] never varies: what it does is not in the data, and "
+                "the model takes it for nothing, so that L1 leaves it alone; record data that move "
+                "it",
+                stacklevel=3,
+            )
         before, after = self.data["observation"], self.data["next", "observation"]
         spread = (after - before).std(0, correction=0)
         step = before.abs().amax(0) * torch.finfo(before.dtype).eps
