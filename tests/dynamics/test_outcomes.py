@@ -110,6 +110,17 @@ def test_a_reward_that_never_changes_is_that_reward() -> None:
     assert math.isfinite(report.explained_variance)
 
 
+def test_inputs_that_never_varied_make_no_reward() -> None:
+    torch.manual_seed(0)
+    model, data = RewardModel(3, 2, hidden=(16,)), transitions(400)
+    for key in ("observation", ("next", "observation")):
+        data[key][:, 2] = 1.5
+    fit_reward(model, data[:300], data[300:], FIT, fused(model))
+    x, u, after = (data[key][:50] for key in ("observation", "action", ("next", "observation")))
+    moved = after + torch.tensor([0.0, 0.0, 0.2])
+    torch.testing.assert_close(model(x, u, moved), model(x, u, after), rtol=0, atol=0)
+
+
 def test_a_separable_termination_is_learned_though_it_is_rare() -> None:
     torch.manual_seed(0)
     data = transitions(6000)

@@ -299,6 +299,7 @@ def _fit(
 ) -> FitReport:
     """Fit the networks to the first rows and targets, and validate them on the second ones."""
     model.input_normalizer.fit(rows[0])
+    model.input_normalizer.ignore((rows[0] == rows[0][:1]).all(0))
     inputs, held_out = map(model.input_normalizer.normalize, rows)
 
     @torch.no_grad()
