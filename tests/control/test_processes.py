@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+from functools import partial
 
 import pytest
 import torch
@@ -56,10 +57,12 @@ def act(observation: Tensor) -> Tensor:
     return 0.4 + 0.05 * observation[..., :1]
 
 
-def make_env() -> TransformedEnv:
-    return TransformedEnv(
-        GymEnv("Pendulum-v1"), Compose(L1Transform(model, CONFIG), StepCounter(4))
-    )
+def make_env(seed: int | None = None) -> TransformedEnv:
+    base = GymEnv("Pendulum-v1")
+    env = TransformedEnv(base, Compose(L1Transform(model, CONFIG), StepCounter(4)))
+    if seed is not None:
+        env.set_seed(seed)
+    return env
 
 
 def make_primed_env() -> TransformedEnv:
@@ -93,7 +96,8 @@ def assert_is_the_core(data: TensorDictBase, u_rl: Tensor) -> None:
 @pytest.mark.parametrize("backend", ["threading", "multiprocessing"])
 def test_in_a_pool(backend):
     options = {"exchange": "queue"} if backend == "multiprocessing" else {}
-    pool = AsyncEnvPool([make_env, make_env], backend=backend, stack="dense", **options)
+    makers = [partial(make_env, seed) for seed in (0, 1)]
+    pool = AsyncEnvPool(makers, backend=backend, stack="dense", **options)
     try:
         data, steps = pool.reset(), []
         for _ in range(4):

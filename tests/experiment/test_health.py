@@ -205,8 +205,8 @@ def spoil_simulation(monkeypatch: pytest.MonkeyPatch, at: int) -> None:
     """From its n-th step on the simulation gives rewards that are no numbers."""
     step, count = TaskSimulation.step, iter(range(10**9))
 
-    def spoilt(self: TaskSimulation, action: torch.Tensor) -> Any:
-        found = step(self, action)
+    def spoilt(self: TaskSimulation, *arguments: Any) -> Any:
+        found = step(self, *arguments)
         return found._replace(reward=found.reward * (math.nan if next(count) >= at else 1.0))
 
     monkeypatch.setattr(TaskSimulation, "step", spoilt)
@@ -285,8 +285,8 @@ def test_a_policy_of_no_numbers_stops_the_run(
 ) -> None:
     step, count = TaskSimulation.step, iter(range(1000))
 
-    def spoilt(self: TaskSimulation, action: torch.Tensor) -> Any:
-        return step(self, action * math.nan if next(count) >= 40 else action)
+    def spoilt(self: TaskSimulation, action: torch.Tensor, *others: Any) -> Any:
+        return step(self, action * math.nan if next(count) >= 40 else action, *others)
 
     monkeypatch.setattr(TaskSimulation, "step", spoilt)
     with pytest.raises(RunDirectoryError) as error:

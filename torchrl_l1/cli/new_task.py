@@ -8,7 +8,8 @@ from pathlib import Path
 
 from torchrl_l1.envs import AnyTask, ExternalTask, get_task
 from torchrl_l1.envs.references import folders_of
-from torchrl_l1.experiment.files import write_atomically, yaml_word
+from torchrl_l1.experiment.files import write_atomically
+from torchrl_l1.experiment.recipes import yaml_word
 from torchrl_l1.experiment.trial import describe
 
 ALGORITHMS = ("pets", "dets", "metrpo", "mbmf")

@@ -247,18 +247,6 @@ _NOT_PLAIN = re.compile(r"[&*!\r\x85\u2028\u2029]|\$\{|^[ \t?:-]{60}|^---|^\.\.\
 _MOST_BRACKETS = 200
 
 
-def yaml_word(text: str) -> str:
-    """A text as a value in a YAML file that is written by hand, quoted where it needs be.
-
-    Examples:
-        >>> print(yaml_word("envs.py:make_env"), yaml_word("a #1"), yaml_word("1e3"))
-        envs.py:make_env 'a #1' '1e3'
-    """
-    if re.fullmatch(r"(?!(?:true|false|null)$)[A-Za-z_/][\w.+/:@-]*(?<!:)", text, re.IGNORECASE):
-        return text
-    return "'" + text.replace("'", "''") + "'"
-
-
 def settings_content(file: Path) -> Any:
     """The content of a YAML file of settings, interpolations as they are written.
 

@@ -11,8 +11,8 @@ from typing import Any
 from omegaconf import OmegaConf
 
 import torchrl_l1
+from torchrl_l1.atomic import write_atomically
 from torchrl_l1.experiment.errors import RecipeError
-from torchrl_l1.experiment.files import write_atomically, yaml_word
 
 # Folders beside the recipes: their groups, and matrices of runs.
 _NOT_RECIPES = ("shared", "campaigns")
@@ -85,6 +85,18 @@ def find_campaign(name: str) -> Path:
         RecipeError: if there is none.
     """
     return _find("campaign", name, available_campaigns(), recipes_dir() / "campaigns")
+
+
+def yaml_word(text: str) -> str:
+    """A text as a value in a YAML file that is written by hand, quoted where it needs be.
+
+    Examples:
+        >>> print(yaml_word("envs.py:make_env"), yaml_word("a #1"), yaml_word("1e3"))
+        envs.py:make_env 'a #1' '1e3'
+    """
+    if re.fullmatch(r"(?!(?:true|false|null)$)[A-Za-z_/][\w.+/:@-]*(?<!:)", text, re.IGNORECASE):
+        return text
+    return "'" + text.replace("'", "''") + "'"
 
 
 def copy_recipe(name: str, file: str | None = None) -> Path:
