@@ -211,10 +211,8 @@ def test_what_chance_makes_of_a_single_seed_is_quoted() -> None:
         assert all(value in text for value in (*returns, added)), page
 
 
-@pytest.mark.parametrize(
-    ("task", "noise"),
-    [*(("half_cheetah", noise) for noise in ("none", "action", "observation")), ("hopper", "none")],
-)
+@pytest.mark.parametrize("task", ["half_cheetah", "hopper"])
+@pytest.mark.parametrize("noise", ["none", "action", "observation"])
 def test_single_seeds_of_table1_are_quoted_as_such(task: str, noise: str) -> None:
     cell = second_edition(task, noise).values()
     assert {row["seeds"] for row in cell} == {"1"}
