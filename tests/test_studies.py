@@ -223,6 +223,15 @@ def test_single_seeds_of_table1_are_quoted_as_such(task: str, noise: str) -> Non
     assert f"{values[0]}, {values[1]} and {values[2]}" in " ".join(text.split())
 
 
+def test_the_first_pairs_of_hopper_are_quoted() -> None:
+    cells = [second_edition("hopper", noise) for noise in ("none", "action", "observation")]
+    text = (ROOT / "docs/studies/index.md").read_text()
+    for l1 in ("paper", "robust"):
+        means = [[float(cell[arm]["return_mean"]) for arm in ("off", l1)] for cell in cells]
+        one, two, three = (f"{on - off:.0f}" for off, on in means)
+        assert f"by {one}, {two} and {three}" in text
+
+
 DISTURBANCES = {
     "actuator delay": "delays",
     "sensor delay": "delays",

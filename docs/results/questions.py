@@ -134,7 +134,7 @@ def table1() -> None:
     """All cells of Table 1: ours where there are runs, beside the paper's."""
     HERE.mkdir(exist_ok=True)
     lines, labels = [], []
-    figure, ax = plt.subplots(figsize=(8, 6), layout="constrained")
+    figure, ax = plt.subplots(figsize=(8, 6.4), layout="constrained")
     cells = [(task, noise) for task in SCALES for noise in NOISES]
     for place, (task, noise) in enumerate(cells):
         run, scale = False, SCALES[task]
@@ -157,7 +157,7 @@ def table1() -> None:
         ax.plot([], [], "D-", color=color_of(0, l1), markersize=4, label=label)
     single = {"color": "0.3", "markersize": 4, "markerfacecolor": "white"}
     ax.plot([], [], "D", **single, label="hollow: a single seed")
-    ax.legend(loc="lower right")
+    figure.legend(loc="outside lower center", ncols=2)
     figure.savefig(HERE / "table1.png", dpi=110)
     plt.close(figure)
     (HERE / "table1.md").write_text(markdown(lines) + "\n")
