@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 import re
-import shlex
-from pathlib import Path
 
-from torchrl_l1.campaign.plan import quoted
 from torchrl_l1.experiment.datasets import check_output, write_dataset
+from torchrl_l1.experiment.errors import typed_override
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.recording import QUALITIES, record
 
@@ -46,6 +44,6 @@ def dataset_command(options: argparse.Namespace) -> None:
         + (f", {found.share:.2f} of the way from random to expert" * (found.share == found.share))
     )
     # Hydra takes such names as they are, and others in quotes.
-    word = name if re.fullmatch(r"[\w./+-]+", name) else quoted(Path(name))
-    override = shlex.quote(f"dataset={word}")
+    plain = re.fullmatch(r"[\w./+-]+", name)
+    override = f"dataset={name}" if plain else typed_override("dataset", name)
     print(f"Dataset: {name}\nTo learn from it: torchrl-l1 run offline/... {override}")

@@ -94,14 +94,24 @@ def message(error: BaseException) -> str:
     return line if len(line) <= _LONGEST else line[:_LONGEST] + " ..."
 
 
+def typed_override(key: str, value: str) -> str:
+    """An override as a shell takes it, whatever characters the value has.
+
+    Examples:
+        >>> print(typed_override("run_dir", "runs/l1=off"))
+        'run_dir="runs/l1=off"'
+    """
+    escaped = value.replace('"', '\\"')
+    return shlex.quote(f'{key}="{escaped}"')
+
+
 def _of_override(text: str, override: str) -> str:
     """Hydra's words with the override that they are of, and without a link to its grammar."""
     text = re.split(r"\s*See https://hydra", text)[0]
     where = "" if override in text else f"{override}: "
     key, _, value = override.partition("=")
-    escaped = value.replace('"', '\\"')
-    word = shlex.quote(f'{key}="{escaped}"')
     # The directories of runs are named by overrides, so that "=" is in many a path.
+    word = typed_override(key, value)
     remedy = f"; a value of such characters has quotes of its own: {word}" if value else ""
     return f"{where}{text}{remedy}"
 

@@ -8,6 +8,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
+import yaml  # type: ignore[import-untyped]
 from omegaconf import OmegaConf
 
 import torchrl_l1
@@ -91,10 +92,11 @@ def yaml_word(text: str) -> str:
     """A text as a value in a YAML file that is written by hand, quoted where it needs be.
 
     Examples:
-        >>> print(yaml_word("envs.py:make_env"), yaml_word("a #1"), yaml_word("1e3"))
-        envs.py:make_env 'a #1' '1e3'
+        >>> print(*map(yaml_word, ("envs.py:make_env", "a #1", "1e3", "off")))
+        envs.py:make_env 'a #1' '1e3' 'off'
     """
-    if re.fullmatch(r"(?!(?:true|false|null)$)[A-Za-z_/][\w.+/:@-]*(?<!:)", text, re.IGNORECASE):
+    # Some words are none for YAML: off, no, null.
+    if re.fullmatch(r"[A-Za-z_/][\w.+/:@-]*(?<!:)", text) and yaml.safe_load(text) == text:
         return text
     return "'" + text.replace("'", "''") + "'"
 
