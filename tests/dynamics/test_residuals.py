@@ -9,7 +9,6 @@ from tensordict import TensorDict
 
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import EnsembleDynamics
-from torchrl_l1.dynamics.fit import one_step_residuals
 from torchrl_l1.dynamics.heads import GaussianHead
 from torchrl_l1.dynamics.residuals import (
     Residuals,
@@ -17,6 +16,7 @@ from torchrl_l1.dynamics.residuals import (
     shrunk_covariance,
     stretches,
 )
+from torchrl_l1.dynamics.validation import one_step_residuals
 
 
 def test_many_residuals_have_the_covariance_that_they_were_drawn_from():

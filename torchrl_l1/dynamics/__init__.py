@@ -29,9 +29,10 @@ from torchrl_l1.dynamics.outcomes import (
     fit_reward,
     fit_termination,
 )
-from torchrl_l1.dynamics.quality import FitQuality, measure_quality
+from torchrl_l1.dynamics.quality import FitQuality
 from torchrl_l1.dynamics.residuals import calibrate_filter
 from torchrl_l1.dynamics.transitions import Transitions, read_transitions
+from torchrl_l1.dynamics.validation import measure_quality
 
 __all__ = [
     "HEADS",

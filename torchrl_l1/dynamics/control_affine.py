@@ -9,8 +9,10 @@ from torch import Tensor
 
 from torchrl_l1.dynamics.ensemble import EnsembleMLP
 from torchrl_l1.dynamics.model import EnsembleDynamics
+from torchrl_l1.dynamics.storage import stored_as
 
 
+@stored_as("affine")
 class ControlAffineDynamics(EnsembleDynamics):
     r"""Control-affine ensemble model, :math:`x_{t+1} - x_t = f(x_t) + G(x_t)\, u_t`.
 

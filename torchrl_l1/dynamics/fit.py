@@ -25,9 +25,10 @@ from torchrl_l1.checks import (
 from torchrl_l1.dynamics.factory import make_dynamics
 from torchrl_l1.dynamics.model import EnsembleDynamics
 from torchrl_l1.dynamics.network import model_precision, resolve_precision
-from torchrl_l1.dynamics.quality import entry_names, measure_quality
+from torchrl_l1.dynamics.quality import entry_names
 from torchrl_l1.dynamics.training_step import Members, TrainingStep
 from torchrl_l1.dynamics.transitions import Data, Transitions, read_transitions, two_parts
+from torchrl_l1.dynamics.validation import measure_quality, one_step_residuals
 
 
 @dataclass
@@ -200,27 +201,6 @@ def evaluate_members(
     for part in data.split(chunk):
         total = total.to(part.device) + loss(part)["member_loss"] * part.shape[0]
     return total / data.shape[0]
-
-
-@torch.no_grad()
-def one_step_residuals(
-    dynamics: EnsembleDynamics, data: TensorDictBase, chunk: int = 20_000
-) -> Tensor:
-    """What the mean of the elites misses of transitions ``[N]``: ``(N, n)``, state units.
-
-    Args:
-        dynamics: the model.
-        data: with ``observation``, ``action`` and ``("next", "observation")``.
-        chunk: rows evaluated at once.
-    """
-    return torch.cat(
-        [
-            part["next", "observation"]
-            - part["observation"]
-            - dynamics.mean_change(part["observation"], part["action"])
-            for part in data.split(chunk)
-        ]
-    )
 
 
 def fit_ensemble(

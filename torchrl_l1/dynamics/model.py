@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -14,12 +14,12 @@ from torchrl_l1.control import ResidualStatistics
 from torchrl_l1.dynamics.ensemble import EnsembleMLP
 from torchrl_l1.dynamics.heads import DeterministicHead, Head
 from torchrl_l1.dynamics.normalizer import DataBox, Normalizer
+from torchrl_l1.dynamics.quality import FitQuality
 from torchrl_l1.dynamics.residuals import Residuals
-
-if TYPE_CHECKING:
-    from torchrl_l1.dynamics.quality import FitQuality
+from torchrl_l1.dynamics.storage import load_dynamics, save_dynamics, stored_as
 
 
+@stored_as("nonlinear")
 class EnsembleDynamics(nn.Module):
     r"""Ensemble model of the change of state, :math:`x_{t+1} - x_t = \hat f(x_t, u_t)`.
 
@@ -346,8 +346,6 @@ class EnsembleDynamics(nn.Module):
             >>> torch.equal(EnsembleDynamics.load(file)(x, u), model(x, u))
             True
         """
-        from torchrl_l1.dynamics.storage import save_dynamics
-
         save_dynamics(self, path)
 
     @classmethod
@@ -365,8 +363,6 @@ class EnsembleDynamics(nn.Module):
             FileNotFoundError: if there is no such file.
             ValueError: if the file is damaged, or holds something else.
         """
-        from torchrl_l1.dynamics.storage import load_dynamics
-
         loaded = load_dynamics(path, device)
         if not isinstance(loaded, cls):
             raise ValueError(f"{path} holds a {type(loaded).__name__}, no {cls.__name__}")

@@ -5,27 +5,37 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_l1.atomic import write_atomically
-from torchrl_l1.dynamics.control_affine import ControlAffineDynamics
 from torchrl_l1.dynamics.heads import DeterministicHead, GaussianHead, Head
-from torchrl_l1.dynamics.model import EnsembleDynamics
 from torchrl_l1.dynamics.quality import FitQuality
 
 _FORMAT = "torchrl_l1.dynamics"
 _VERSION = 1
-_FORMS = {"nonlinear": EnsembleDynamics, "affine": ControlAffineDynamics}
+_FORMS: dict[str, type[nn.Module]] = {}
+
+Model = TypeVar("Model", bound=nn.Module)
 
 
-def save_dynamics(dynamics: EnsembleDynamics, path: str | os.PathLike[str]) -> None:
+def stored_as(form: str) -> Callable[[type[Model]], type[Model]]:
+    """Decorator of a class of models that files know by this name."""
+
+    def enter(kind: type[Model]) -> type[Model]:
+        _FORMS[form] = kind
+        return kind
+
+    return enter
+
+
+def save_dynamics(dynamics: nn.Module, path: str | os.PathLike[str]) -> None:
     """Write a model to a file, see :meth:`EnsembleDynamics.save`."""
     from safetensors.torch import save
 
@@ -42,9 +52,7 @@ def save_dynamics(dynamics: EnsembleDynamics, path: str | os.PathLike[str]) -> N
     write_atomically(Path(path), save(tensors, metadata))
 
 
-def load_dynamics(
-    path: str | os.PathLike[str], device: torch.device | str = "cpu"
-) -> EnsembleDynamics:
+def load_dynamics(path: str | os.PathLike[str], device: torch.device | str = "cpu") -> nn.Module:
     """Read a model from a file, see :meth:`EnsembleDynamics.load`."""
     from safetensors import SafetensorError, safe_open
 
@@ -75,7 +83,7 @@ def load_dynamics(
         raise ValueError(f"{path} holds no model: {_line(error)}") from error
 
 
-def _settings(dynamics: EnsembleDynamics) -> dict[str, Any]:
+def _settings(dynamics: Any) -> dict[str, Any]:
     """All that :func:`_restored` needs beside the tensors."""
     forms = [name for name, kind in _FORMS.items() if type(dynamics) is kind]
     if not forms:
@@ -111,7 +119,7 @@ def _head_settings(head: Head) -> dict[str, Any]:
 
 def _restored(
     settings: dict[str, Any], tensors: Mapping[str, Tensor], device: torch.device
-) -> EnsembleDynamics:
+) -> nn.Module:
     sizes = [settings["observation_dim"] + settings["action_dim"], *settings["hidden"]]
     weights = settings["members"] * sum(a * b for a, b in pairwise(sizes))
     # Before any memory is asked for.
@@ -123,12 +131,13 @@ def _restored(
     settings["head"] = GaussianHead(**head) if gaussian else DeterministicHead()
     # Weights are drawn that are not used: the caller's random numbers stay as they are.
     with torch.random.fork_rng(devices=[]):
-        dynamics = _FORMS[kind](**settings)
+        dynamics: Any = _FORMS[kind](**settings)
     dynamics.to(device=device, dtype=tensors["change_normalizer.mean"].dtype)
     dynamics.load_state_dict(dict(tensors))
     if quality is not None:
         dynamics.quality = _quality(quality)
-    return dynamics.eval()
+    restored: nn.Module = dynamics.eval()
+    return restored
 
 
 def _quality(stored: dict[str, Any]) -> FitQuality:

@@ -25,7 +25,7 @@ from torchrl_l1.algorithms.collection import (
 from torchrl_l1.algorithms.policy import kinds_of
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import calibrate_filter
-from torchrl_l1.dynamics.fit import one_step_residuals
+from torchrl_l1.dynamics.validation import one_step_residuals
 from torchrl_l1.envs import DISTURBANCES, AnyTask, ExternalTask, Perturbation
 from torchrl_l1.experiment.checkpoints import KEPT, kept_by, load_state
 from torchrl_l1.experiment.errors import RunDirectoryError, fitting_into_memory, message
