@@ -37,16 +37,9 @@ def layer(name: str) -> str | None:
     return parts[1] if len(parts) > 1 and (PACKAGE / parts[1]).is_dir() else None
 
 
-def imported(file: Path, *, when_loaded: bool) -> Iterator[str]:
-    """Modules of ours that a file imports: when it is loaded, or at any time."""
-    todo: list[ast.AST] = [ast.parse(file.read_text(encoding="utf-8"))]
-    while todo:
-        node = todo.pop()
-        later = isinstance(node, ast.FunctionDef) or (
-            isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
-        )
-        if not (later and when_loaded):
-            todo += ast.iter_child_nodes(node)
+def imported(file: Path) -> Iterator[str]:
+    """Modules of ours that a file imports: when it is loaded, later, or for its types."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -88,7 +81,7 @@ def test_imports_point_one_way() -> None:
     wrong = [
         f"{name} imports {other}"
         for name, file in MODULES.items()
-        for other in imported(file, when_loaded=False)
+        for other in imported(file)
         if (here := layer(name)) and (there := layer(other))
         if ORDER.index(there) > ORDER.index(here)
     ]
@@ -99,14 +92,12 @@ def test_what_serves_all_imports_none_of_them() -> None:
     others = [name for name in MODULES if layer(name) is None and name != "torchrl_l1"]
     assert "torchrl_l1.compilation" in others
     for name in others:
-        assert not list(imported(MODULES[name], when_loaded=False)), name
+        assert not list(imported(MODULES[name])), name
 
 
 def test_modules_make_no_circle() -> None:
     graph = {
-        name: {
-            other for other in imported(file, when_loaded=True) if other not in (name, "torchrl_l1")
-        }
+        name: {other for other in imported(file) if other not in (name, "torchrl_l1")}
         for name, file in MODULES.items()
     }
     try:
