@@ -1,0 +1,78 @@
+"""METRPO on HalfCheetah with a learned reward beside the task's own, round by round.
+
+    python docs/results/learned_rewards.py [FOLDER]
+
+Reads `metrics.csv` of the runs in FOLDER/built_in/seed_N and FOLDER/learned/seed_N, if a FOLDER is
+given, and keeps what is shown of them in `learned_rewards.csv` beside this file. Writes from it
+`learned_rewards.md` and `learned_rewards.png`.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+
+from torchrl_l1.experiment.files import write_table
+from torchrl_l1.report.page import markdown
+from torchrl_l1.report.style import color, grid, save
+
+KEPT = Path(__file__).with_suffix(".csv")
+WORDS = {"built_in": "built in", "learned": "learned"}
+EXPLAINED = "reward_model/explained_variance"
+MOST_STEPS = 96_000
+Row = dict[str, str]
+
+
+def gather(folder: Path) -> None:
+    """Keep steps, returns and the fit of the reward of all runs in one file."""
+    rows: list[Row] = []
+    for file in sorted(folder.glob("*/seed_*/metrics.csv")):
+        own = {"reward": file.parts[-3], "seed": file.parts[-2].removeprefix("seed_")}
+        with file.open(newline="") as handle:
+            rows += [
+                own
+                | {name: row[name] for name in ("real_steps", "return_mean")}
+                | {"explained_variance": row.get(EXPLAINED, "")}
+                for row in csv.DictReader(handle)
+                if int(row["real_steps"]) <= MOST_STEPS
+            ]
+    write_table(KEPT, rows)
+
+
+def main() -> None:
+    """Read what is new, then write table and figure."""
+    if len(sys.argv) > 1:
+        gather(Path(sys.argv[1]))
+    with KEPT.open(newline="") as handle:
+        rows = list(csv.DictReader(handle))
+    runs: dict[tuple[str, str], dict[int, Row]] = {}
+    for row in rows:
+        runs.setdefault((row["reward"], row["seed"]), {})[int(row["real_steps"])] = row
+    table = []
+    for steps in sorted({int(row["real_steps"]) for row in rows}):
+        line = {"real steps": str(steps)}
+        for (reward, seed), at in runs.items():
+            returned = f"{float(at[steps]['return_mean']):.0f}" if steps in at else ""
+            line[f"{WORDS[reward]}, seed {seed}"] = returned
+        explained = [at[steps]["explained_variance"] for at in runs.values() if steps in at]
+        line["explained variance"] = f"{min(float(one) for one in explained if one):.5f}"
+        table.append(line)
+    KEPT.with_suffix(".md").write_text(markdown(table) + "\n")
+    figure, (axis,) = grid(1, 1, 6.4, 3.6)
+    for (reward, seed), at in runs.items():
+        axis.plot(
+            list(at),
+            [float(row["return_mean"]) for row in at.values()],
+            "-" if reward == "learned" else "--",
+            color=color(int(seed)),
+            label=f"{WORDS[reward]}, seed {seed}",
+        )
+    axis.set(title="METRPO on HalfCheetah, by its reward", xlabel="real steps", ylabel="return")
+    axis.legend(frameon=False, fontsize=8, loc="upper left")
+    save(figure, KEPT.with_suffix(".png"))
+    print(f"Table: {KEPT.with_suffix('.md')}\nFigure: {KEPT.with_suffix('.png')}")
+
+
+if __name__ == "__main__":
+    main()
