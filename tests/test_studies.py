@@ -7,7 +7,9 @@ import csv
 import importlib
 import importlib.util
 import re
+import shutil
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -16,13 +18,14 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs/results"
+TABLES = (".md", ".csv")
 TASKS = ("inverted_pendulum", "swimmer", "hopper", "walker", "half_cheetah")
 
 
-def script(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def script(name: str, monkeypatch: pytest.MonkeyPatch, folder: Path = RESULTS) -> ModuleType:
     """A script of the results' folder, as it is when it is run from there."""
-    monkeypatch.syspath_prepend(str(RESULTS))
-    spec = importlib.util.spec_from_file_location(name, RESULTS / f"{name}.py")
+    monkeypatch.syspath_prepend(str(folder))
+    spec = importlib.util.spec_from_file_location(name, folder / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, name, module)
     spec.loader.exec_module(module)
@@ -58,6 +61,31 @@ def test_scripts_of_the_documentation_find_what_they_import() -> None:
                 except ModuleNotFoundError:
                     missing.append(f"{file.name}: {module}.{name}")
     assert not missing
+
+
+REGENERATED = ("any_task", "in_the_loop", "learned_rewards", "mbrl_cartpole", "planners")
+REGENERATED += ("precision", "questions", "robust", "suite")
+
+
+@pytest.mark.parametrize("name", REGENERATED)
+def test_tables_are_what_the_scripts_write_from_the_committed_data(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = tmp_path / "results"
+    shutil.copytree(RESULTS, copy, ignore=shutil.ignore_patterns("*.png", "__pycache__"))
+    shutil.copytree(ROOT / "docs/studies", tmp_path / "studies")
+    started = time.time_ns()
+    before = {file: file.read_text() for file in copy.rglob("*.*") if file.suffix in TABLES}
+    # Else that of another test would be taken for the copy's.
+    for other in copy.glob("*.py"):
+        monkeypatch.delitem(sys.modules, other.stem, raising=False)
+    with monkeypatch.context() as alone:
+        alone.setattr(sys, "argv", [f"{name}.py"])
+        script(name, alone, copy).main()
+    written = [file for file in copy.rglob("*.md") if file.stat().st_mtime_ns > started]
+    assert written, "it has written nothing, or elsewhere"
+    after = {file: file.read_text() for file in copy.rglob("*.*") if file.suffix in TABLES}
+    assert [file.name for file in after if before.get(file) != after[file]] == []
 
 
 def section(page: str, heading: str) -> str:
