@@ -92,3 +92,21 @@ def test_a_line_without_a_finished_run_is_in_the_legend(
     }
     assert {"L1 off", "L1 paper", "unfinished run"} <= set(entries)
     assert entries["L1 off"] != entries["L1 paper"]
+
+
+def test_every_point_of_the_figures_is_in_a_table(write_run: WriteRun, tmp_path: Path) -> None:
+    write_run([-3.0, -2.0, -1.0], "l1=off")
+    write_run([-4.0, -2.5, 0.1], "l1=paper", seed=3)
+    rows = curves.curve_rows(Study(find_runs([tmp_path])))
+    shown = [
+        (row["l1"], row["seed"], row["iteration"], row["real_steps"], row["return"]) for row in rows
+    ]
+    assert shown == [
+        ("off", 0, 0, 5000, -3.0),
+        ("off", 0, 1, 7500, -2.0),
+        ("off", 0, 2, 10000, -1.0),
+        ("paper", 3, 0, 5000, -4.0),
+        ("paper", 3, 1, 7500, -2.5),
+        ("paper", 3, 2, 10000, 0.1),
+    ]
+    assert all(row["task"] == "inverted_pendulum" and row["noise"] == "none" for row in rows)

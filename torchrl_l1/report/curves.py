@@ -14,7 +14,7 @@ from torchrl_l1.report.identity import BASELINE, facts
 from torchrl_l1.report.page import Page
 from torchrl_l1.report.published import Curves, ReferenceCurves
 from torchrl_l1.report.runs import Run
-from torchrl_l1.report.study import Cell, Study
+from torchrl_l1.report.study import Cell, Study, place_columns
 from torchrl_l1.report.style import (
     arm_label,
     color,
@@ -53,6 +53,32 @@ def curve_section(page: Page, study: Study, reference: ReferenceCurves | None) -
         file = page.file("learning_curves", task)
         figure = plot_task(study, task, file, reference, page.name)
         page.figure(figure, f"Learning curves, {title(task)}")
+    page.csv("learning_curves", curve_rows(study))
+
+
+def curve_rows(study: Study) -> list[dict[str, Any]]:
+    """One row per run and outer iteration, unfinished runs included: what the figures draw."""
+    rows = []
+    for cell, runs in study.cells.items():
+        for run in runs:
+            for at, steps in enumerate(run.real_steps):
+                row = {**place_columns(cell), "seed": run.identity.seed}
+                if run.stage is not None:
+                    row["stage"] = int(run.stage[at])
+                row |= {
+                    "iteration": at,
+                    "real_steps": int(steps),
+                    "return": _digits(run.returns[at]),
+                }
+                if study.facts.samples:
+                    row["return_deterministic"] = _digits(run.deterministic[at])
+                rows.append(row)
+    return rows
+
+
+def _digits(value: float) -> float:
+    """As many as a sum of 32-bit rewards has."""
+    return float(f"{value:.8g}")
 
 
 def _dashed(study: Study) -> str:
