@@ -3,8 +3,8 @@
     python docs/results/questions.py
 
 Reads `baselines/`, `table1_first/`, `table1/` and `robust/` beside this file, which the commands of
-their pages write, and the paper's table. Writes `questions/table1.md` and `.png`, and
-`questions/recovered.md` and `.png`.
+their pages write, and the paper's table. Writes `questions/table1.md` and `.png`,
+`questions/ahead.md`, and `questions/recovered.md` and `.png`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import robust
 from matplotlib.axes import Axes
+from scipy.stats import binomtest
 
 from torchrl_l1.report.page import interval_text, markdown, number
 from torchrl_l1.report.published import published_cells
@@ -163,6 +164,35 @@ def table1() -> None:
     (HERE / "table1.md").write_text(markdown(lines) + "\n")
 
 
+def ahead() -> None:
+    """In how many pairs of seeds the return is higher with L1 in training, by task and noise.
+
+    Pairs without any difference count for neither.
+    """
+    groups = ["all", *(task.replace("_", " ") for task in SCALES), *map("noise {}".format, NOISES)]
+    lines = []
+    for l1 in ARMS:
+        signs: dict[str, list[bool]] = {}
+        for task in SCALES:
+            for noise in NOISES:
+                found = ours(task, noise, l1)
+                if found is None or found.pair is None:
+                    continue
+                differences = map(float, found.pair["differences"].split())
+                higher = [difference > 0 for difference in differences if difference]
+                for group in ("all", task.replace("_", " "), f"noise {noise}"):
+                    signs.setdefault(group, []).extend(higher)
+        every = signs["all"]
+        ends = binomtest(sum(every), len(every)).proportion_ci()
+        share = f"{np.mean(every):.2f} [{ends.low:.2f}, {ends.high:.2f}]"
+        counted = {
+            group: f"{sum(signs[group])} of {len(signs[group])}" if signs.get(group) else ""
+            for group in groups
+        }
+        lines.append({"L1 in training": l1, "share": share, **counted})
+    (HERE / "ahead.md").write_text(markdown(lines) + "\n")
+
+
 def recovered() -> None:
     """What the controllers recover of the oracle's gain, by task."""
     HERE.mkdir(exist_ok=True)
@@ -197,6 +227,7 @@ def recovered() -> None:
 def main() -> None:
     """Write all of it."""
     table1()
+    ahead()
     recovered()
     print(f"Tables and figures: {HERE}")
 
