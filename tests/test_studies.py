@@ -63,7 +63,7 @@ def test_scripts_of_the_documentation_find_what_they_import() -> None:
     assert not missing
 
 
-REGENERATED = ("any_task", "in_the_loop", "learned_rewards", "mbrl_cartpole", "planners")
+REGENERATED = ("acting", "any_task", "in_the_loop", "learned_rewards", "mbrl_cartpole", "planners")
 REGENERATED += ("precision", "questions", "robust", "suite")
 
 
@@ -327,3 +327,27 @@ def test_offline_page_and_the_advice_quote_what_robust_costs_hopper() -> None:
         assert 0.55 < 1 - of["robust"] / of["off"] < 0.65
     for page in ("README.md", "docs/studies/index.md", "docs/studies/offline.md"):
         assert "three fifths" in (ROOT / page).read_text(), page
+
+
+def test_robustness_page_quotes_the_rules_by_which_it_acts() -> None:
+    with (RESULTS / "acting.csv").open(newline="") as handle:
+        gains = {
+            (row["task"], row["condition"], row["seed"], row["rule"]): float(row["difference"])
+            for row in csv.DictReader(handle)
+        }
+    cells = [key[1:3] for key in gains if key[0] == "walker" and key[1] in ("bias 0.2", "bias 0.4")]
+    total = {
+        rule: sum(gains["walker", *cell, rule] for cell in dict.fromkeys(cells))
+        for rule in ("oracle", "dead zone, z = 1", "dead zone, z = 2")
+    }
+    one, two = (total[f"dead zone, z = {z}"] / total["oracle"] for z in (1, 2))
+    text = " ".join((ROOT / "docs/studies/robustness.md").read_text().split())
+    assert f"gets back {one:.2f} of the oracle's gain under these two biases" in text
+    assert f"where two get back {two:.2f}" in text
+    rules = {row["rule"]: row for row in rows((RESULTS / "acting.md").read_text())}
+    every, less = (
+        re.findall(r"-(\d+)\.\d", rules[rule]["observation noise"])
+        for rule in ("everything (z = 0)", "expected estimate subtracted")
+    )
+    words = "costs {0} and {2} % of the return with noisy observations, {1} and {3} % on the worst"
+    assert words.format(*every, *less) in text

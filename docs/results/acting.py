@@ -1,6 +1,6 @@
 """Rules by which the robust controller acts on its estimate, compared on frozen policies.
 
-    python docs/results/acting.py RUN [RUN ...]
+    python docs/results/acting.py [RUN ...]
 
 Every rule gets the same posterior mean d and standard deviation s of the disturbance, from the same
 Kalman filter, and says what the input cancels. Keeps the returns of 16 episodes of the policy's
@@ -164,8 +164,9 @@ def _value(
     return None
 
 
-def main(runs: Sequence[str]) -> None:
-    """All of it."""
+def main() -> None:
+    """Test the policies of the runs that are named, then write the tables."""
+    runs = sys.argv[1:]
     kept = HERE / "acting.csv"
     rows: list[Row] = [row for run in runs for row in compare(load_run(run))]
     with kept.open(newline="") as handle:
@@ -184,4 +185,4 @@ def main(runs: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()
