@@ -25,7 +25,7 @@ from torchrl.envs import (
 )
 
 from tests.control.compositions import BOTH, Identity, Pipeline, model, normaliser, pendulum, two
-from torchrl_l1.control import L1Controller, L1Transform, init
+from torchrl_l1.control import L1Controller, L1Transform, OracleTransform, init
 from torchrl_l1.envs import (
     ActionNoise,
     ActuatorBias,
@@ -344,3 +344,26 @@ def test_without_a_seal_the_controller_trusts() -> None:
         observation=torch.ones(2, 3), action=torch.ones(2, 1), l1=nested, batch_size=[2]
     )
     assert controller(data)["next", "l1", "started"].all()
+
+
+@pytest.mark.parametrize("face", [L1Transform, L1Controller, OracleTransform])
+def test_entries_are_under_one_name(face: type) -> None:
+    settings = {} if face is OracleTransform else {"dynamics": model, "dt": 0.05}
+    with pytest.raises(TypeError, match=rf"{face.__name__} keeps .* must be a str, got \('agen"):
+        face(key=("agents", "l1"), **settings)
+
+
+def test_a_model_converted_to_another_type_is_noticed() -> None:
+    class Pushed(nn.Linear):
+        def forward(self, x: Tensor, u: Tensor) -> Tensor:
+            return super().forward(u)
+
+    dynamics = Pushed(1, 3)
+    l1 = L1Transform(dynamics, dt=0.05)
+    dynamics.double()  # before the environment is there it is no matter
+    env = TransformedEnv(pendulum(), l1)
+    data = env.rollout(3)
+    assert data["l1", "x_hat"].dtype == torch.float64
+    dynamics.float()
+    with pytest.raises(ValueError, match=r"model is of torch.float32 and was of torch.float64"):
+        env.reset()

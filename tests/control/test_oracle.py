@@ -23,7 +23,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_l1.control import OracleTransform
+from torchrl_l1.control import L1Transform, OracleTransform
 from torchrl_l1.envs import ActionNoise, BatchedMujocoEnv, make_env
 
 
@@ -176,3 +176,28 @@ def test_stored_data_are_refused() -> None:
         buffer.extend(data)
     with pytest.raises(RuntimeError, match="'u_exec'"):
         OracleTransform()(data)
+
+
+@pytest.mark.parametrize("outside", [False, True])
+def test_another_controller_beside_it_is_refused(outside: bool) -> None:
+    def push(x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat([u, -u, u, -u], -1)
+
+    for other in (OracleTransform(key="first"), L1Transform(push, dt=0.04, key="first")):
+        env, _ = environment(shifted(0.5), other)
+        if outside:
+            env = TransformedEnv(env, OracleTransform(), auto_unwrap=False)
+        else:
+            env.append_transform(OracleTransform())
+        name = type(other).__name__
+        with pytest.raises(ValueError, match=f"{name} is there beside OracleTransform"):
+            env.reset()
+
+
+def test_disturbances_within_the_members_of_a_batch_are_out_of_reach() -> None:
+    def member() -> TransformedEnv:
+        return TransformedEnv(GymEnv("InvertedPendulum-v5"), shifted(0.5))
+
+    env = TransformedEnv(SerialEnv(2, member), OracleTransform())
+    with pytest.raises(ValueError, match=r"Disturbed is within the members of a SerialEnv.*write"):
+        env.reset()

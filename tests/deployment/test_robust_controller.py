@@ -226,3 +226,11 @@ def test_a_disturbance_in_the_data_is_noticed():
 
     with pytest.warns(UserWarning, match="brings ActuatorBias along"):
         robustify(make, balance, 60, fit=QUICK, **TINY)
+
+
+def test_an_environment_with_a_controller_is_refused(robust):
+    def make() -> EnvBase:
+        return robust.wrap(GymEnv("InvertedPendulum-v5"))
+
+    with pytest.raises(ValueError, match="brings L1Transform along"):
+        robustify(make, balance, 60, fit=QUICK, **TINY)

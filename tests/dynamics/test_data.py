@@ -103,6 +103,19 @@ def test_empty_cells_and_other_habits(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("delimiter", "lines"),
+    [
+        (" ", ["angle  rate   torque", " 0.1 2      3", "4   5e-1   6 "]),
+        (",", ["", '"angle", "rate", "torque"', '"0.1", 2, 3', "4, 0.5, 6"]),
+    ],
+)
+def test_columns_padded_with_spaces(tmp_path: Path, delimiter: str, lines: list[str]) -> None:
+    data = read_csv(write(tmp_path / "log.csv", *lines), **KEYS, delimiter=delimiter)
+    assert data["observation"].tolist() == [[0.1, 2.0]] and data["action"].tolist() == [[3.0]]
+    assert data["next", "observation"].tolist() == [[4.0, 0.5]]
+
+
+@pytest.mark.parametrize(
     ("lines", "options", "error", "message"),
     [
         (["angle,rate", "0,0"], {}, KeyError, "no column 'torque', only angle, rate"),
@@ -114,6 +127,14 @@ def test_empty_cells_and_other_habits(tmp_path: Path) -> None:
             ValueError,
             "line 3, column 'rate': 'off' is no number",
         ),
+        (
+            # As R writes it, with the names of the rows; and with decimal commas.
+            ["angle,rate,torque", "1,0,0,0", "2,0,0,0"],
+            {},
+            ValueError,
+            "line 2 has 4 cells for 3 columns: there is a column without a name, or a ','",
+        ),
+        (["angle\trate\ttorque"], {"delimiter": "\\t"}, ValueError, "delimiter is one character"),
         (["angle,rate,torque,rate", "0,0,0,1"], {}, ValueError, "2 columns 'rate': rename them"),
         (["angle,rate,torque", f"{10**6 * '0'}"], {}, ValueError, "no table of text: field larger"),
         (["angle,rate,torque", "0,0,0"], {}, ValueError, "1 rows, of which none follows"),

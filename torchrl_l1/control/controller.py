@@ -26,6 +26,7 @@ from torchrl_l1.control.layout import (
     advance,
     as_action_jacobian,
     declared_dimension,
+    entry_name,
     required_entry,
 )
 from torchrl_l1.control.pipeline import (
@@ -328,7 +329,7 @@ class L1Controller(TensorDictModuleBase):
         )
         self.observation_key = observation_key
         self.action_key = action_key
-        self.key = key
+        self.key = entry_name(key, "L1Controller")
         self.compile_mode = compile
         self.diagnostics = diagnostics
         self.check_dt, self.check = check_dt, check

@@ -183,7 +183,8 @@ def refuse_training(dynamics: object) -> None:
     """
     for root in _modules(dynamics):
         for name, layer in root.named_modules():
-            if layer.training and _needs_eval(layer):
+            # What torch.jit.freeze made has no mode any more.
+            if getattr(layer, "training", False) and _needs_eval(layer):
                 raise ValueError(
                     f"{describe(dynamics)} is in train mode, in which its layer "
                     f"{_label(name, layer)} gives L1 another prediction at each call or mixes the "
@@ -328,6 +329,15 @@ def _warn_of_reverse(
         f"{describe(dynamics)} is differentiated in reverse mode{cause}: a Jacobian takes {n} "
         f"backward passes in place of {m} forward ones, and a step one Jacobian or two",
         stacklevel=2,
+    )
+
+
+def failure(dynamics: object, observation: Tensor, action: Tensor, error: Exception) -> ValueError:
+    """What to raise where a model cannot be called at all."""
+    return ValueError(
+        f"{describe(dynamics)} failed at its first call, with two arguments, an observation of "
+        f"shape {tuple(observation.shape)} and an action of shape {tuple(action.shape)}, both "
+        f"{observation.dtype}, which L1 expects a model to take: {_first_line(error)}"
     )
 
 

@@ -285,6 +285,8 @@ def load_policy(
             found.load_state_dict(stored)
         except (RuntimeError, TypeError, AttributeError) as error:
             raise ValueError(f"{weights} does not fit the policy: {_short(error)}") from error
+    if isinstance(found, nn.Module):
+        _check_mode(found)
     if isinstance(found, TensorDictModuleBase):
         _check_keys(found, env)
         return found
@@ -294,6 +296,21 @@ def load_policy(
     if isinstance(found, StableBaselinesPolicy):
         _warn_of_bounds(found, action)
     return FunctionPolicy(found, env.full_observation_spec["observation"], action)
+
+
+def _check_mode(policy: nn.Module) -> None:
+    """Refuse a policy in train mode that normalises by the batch, and tell of one that draws."""
+    for name, layer in policy.named_modules():
+        if not getattr(layer, "training", False):
+            continue
+        words = f"the policy is in train mode, in which its layer {name} ({type(layer).__name__})"
+        if isinstance(layer, nn.modules.batchnorm._BatchNorm):
+            raise ValueError(
+                f"{words} mixes the environments of a batch and learns from them: call its eval()"
+            )
+        drops = isinstance(layer, nn.modules.dropout._DropoutNd) and layer.p > 0
+        if drops and isinstance(policy, TensorDictModuleBase):
+            warnings.warn(f"{words} draws at random: call its eval()", stacklevel=3)
 
 
 def _check_keys(policy: TensorDictModuleBase, env: EnvBase) -> None:

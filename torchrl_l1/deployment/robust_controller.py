@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -23,11 +22,13 @@ from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.control.layout import Layout
 from torchrl_l1.deployment.assessment import Assessment, Disturbances, assess
 from torchrl_l1.deployment.learning import (
+    check_surroundings,
     collect,
     epsilon_for,
     policy_transforms,
     recorded,
     target_switch_rate,
+    warn_of_disturbances,
 )
 from torchrl_l1.deployment.policies import Policy, load_policy
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, calibrate_filter, fit_dynamics
@@ -334,7 +335,8 @@ def robustify(
 
     Raises:
         ValueError: for a setting out of its domain, an environment that does not tell its time
-            step, or observations and actions that are no vectors.
+            step or has a controller already, observations and actions that are no vectors, or a
+            policy whose actions do not fit.
 
     Examples:
         >>> from torchrl_l1.dynamics import FitConfig
@@ -361,12 +363,13 @@ def robustify(
         )
     with _private_randomness():
         env = source.one()
+        check_surroundings(env)
         acting = load_policy(policy, env, normalization, weights)
         if data is None:
             with _bar("collect", "step", progress) as bar:
                 bar.total = steps
                 found = collect(source, acting, steps, environments, noise, seed, bar.update)
-            _warn_of_disturbances(env)
+            warn_of_disturbances(env)
             data = found
         else:
             found = recorded(data, env)
@@ -402,20 +405,6 @@ def robustify(
         source, acting, dynamics, {name: configs[name] for name in reversed(order)},
         preset, origin,
     )  # fmt: skip
-
-
-def _warn_of_disturbances(env: EnvBase) -> None:
-    """Data are to be of the undisturbed plant: a bias in them is nominal to the model."""
-    while isinstance(env, TransformedEnv):
-        for transform in env.transform.modules():
-            if callable(getattr(transform, "compensate", None)):
-                warnings.warn(
-                    f"the environment brings {type(transform).__name__} along: the model takes "
-                    "it for the plant's, and L1 will not cancel it; give robustify the undisturbed "
-                    "environment, and evaluate the disturbances",
-                    stacklevel=3,
-                )
-        env = env.base_env
 
 
 def load_target(

@@ -57,7 +57,8 @@ def read_csv(
     Raises:
         FileNotFoundError: if there is no such file.
         KeyError: if there is no such column.
-        ValueError: for a cell that is no number, or if no two lines follow each other.
+        ValueError: for a cell that is no number, a line with more cells than there are columns, or
+            if no two lines follow each other.
 
     Examples:
         >>> from pathlib import Path
@@ -220,10 +221,13 @@ def _columns(
     """Columns of a table by name; those of ``numbers`` as numbers, empty cells as NaN."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file")
+    if len(delimiter) != 1:
+        raise ValueError(f"{path}: the delimiter is one character, like '\\t', got {delimiter!r}")
     # A byte order mark is none of the first column's name.
     with open(path, newline="", encoding="utf-8-sig") as file:
-        lines = csv.reader(file, delimiter=delimiter)
-        header = [name.strip() for name in next(lines, [])]
+        # Spaces after a delimiter keep quotes from being seen, and are themselves delimiters.
+        lines = csv.reader(file, delimiter=delimiter, skipinitialspace=True)
+        header = [name.strip() for name in next(filter(None, lines), [])]
         if header:
             header[0] = header[0].removeprefix("#").strip()
         for name in wanted:
@@ -238,6 +242,11 @@ def _columns(
         for line in lines:
             if not any(cell.strip() for cell in line):
                 continue
+            if any(cell.strip() for cell in line[len(header) :]):
+                raise ValueError(
+                    f"{path}, line {lines.line_num} has {len(line)} cells for {len(header)} "
+                    f"columns: there is a column without a name, or a {delimiter!r} within numbers"
+                )
             for name, place in places.items():
                 cell = line[place].strip() if place < len(line) else ""
                 if name in numbers:
