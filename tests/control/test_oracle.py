@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data import Composite, LazyTensorStorage, ReplayBuffer
 from torchrl.envs import (
     ActionScaling,
     Compose,
@@ -24,7 +24,9 @@ from torchrl.envs import (
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_l1.control import L1Transform, OracleTransform
-from torchrl_l1.envs import ActionNoise, BatchedMujocoEnv, make_env
+from torchrl_l1.envs import ActionNoise, ActuatorBias, BatchedMujocoEnv, make_env
+
+ONES = torch.ones(3, 1)
 
 
 class Disturbed(Transform):
@@ -201,3 +203,15 @@ def test_disturbances_within_the_members_of_a_batch_are_out_of_reach() -> None:
     env = TransformedEnv(SerialEnv(2, member), OracleTransform())
     with pytest.raises(ValueError, match=r"Disturbed is within the members of a SerialEnv.*write"):
         env.reset()
+
+
+def test_a_disturbance_of_another_action_is_none_of_its_business() -> None:
+    plain = BatchedMujocoEnv("inverted_pendulum", 3, seed=0)
+    actuator = plain.action_spec.clone()
+    plain.action_spec = Composite(action=actuator, other=actuator.clone(), shape=[3])
+    chain = ActuatorBias(0.5, "other"), ActuatorBias(0.25), OracleTransform()
+    env = TransformedEnv(plain, Compose(*chain))
+    env.append_transform(OracleTransform("other", key="beside"))
+    after = env.step(env.reset().update({"action": ONES, "other": 2 * ONES}))["next"]
+    assert after["l1", "u_exec"].unique().tolist() == [0.75]
+    assert after["beside", "u_exec"].unique().tolist() == [1.5]

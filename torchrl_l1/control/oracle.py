@@ -22,9 +22,6 @@ from torchrl_l1.control.controller import L1Primer
 from torchrl_l1.control.layout import L1_KEY, entry_name, required_entry
 from torchrl_l1.control.transform import L1Transform
 
-# Where the executed input waits, inside the tensordict, for the base environment to return.
-_PENDING = "_oracle_pending"
-
 
 class OracleTransform(Transform):
     r"""A clairvoyant in the place of :class:`~torchrl_l1.control.L1Transform`.
@@ -77,6 +74,8 @@ class OracleTransform(Transform):
         super().__init__()
         self.action_key = unravel_key(action_key)
         self.key = entry_name(key, "OracleTransform")
+        # Where the executed input waits, inside the tensordict, for the base environment to return.
+        self._pending = f"_{key}_oracle_pending"
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the executed input."""
@@ -104,10 +103,10 @@ class OracleTransform(Transform):
                 executed = executed.clamp(bounds.space.low, bounds.space.high)
         # The caller's tensordict keeps the policy's action: this one is a shallow copy.
         tensordict.set(self.action_key, executed)
-        return tensordict.set(_PENDING, executed)
+        return tensordict.set(self._pending, executed)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        executed = tensordict.get(_PENDING)
+        executed = tensordict.get(self._pending)
         stepped = tensordict.get("_step", None)
         if stepped is not None:
             before = tensordict.get((self.key, "u_exec"))
@@ -159,7 +158,7 @@ class OracleTransform(Transform):
             if transform is self:
                 return
             compensate = getattr(transform, "compensate", None)
-            if compensate is not None:
+            if compensate is not None and self._is_of_this_action(transform, "key"):
                 undone = type(transform).__name__
                 yield compensate
             elif undone and self._changes_units(transform):
@@ -172,9 +171,9 @@ class OracleTransform(Transform):
     def _check_surroundings(self) -> None:
         environment = self._environment()
         for transform in _transforms(environment):
-            if isinstance(transform, (L1Primer, L1Transform, OracleTransform)) and (
-                transform is not self
-            ):
+            is_controller = isinstance(transform, (L1Primer, L1Transform, OracleTransform))
+            is_other = is_controller and transform is not self
+            if is_other and self._is_of_this_action(transform, "action_key"):
                 raise ValueError(
                     f"{type(transform).__name__} is there beside OracleTransform, and both would "
                     "act against one disturbance: leave one of them out"
@@ -183,13 +182,17 @@ class OracleTransform(Transform):
             environment = environment.base_env
         members = environment.__dict__.get("_envs", []) if type(environment) is SerialEnv else []
         for transform in (inner for member in members for inner in _transforms(member)):
-            if callable(getattr(transform, "compensate", None)):
+            disturbs = callable(getattr(transform, "compensate", None))
+            if disturbs and self._is_of_this_action(transform, "key"):
                 name = type(transform).__name__
                 raise ValueError(
                     f"{name} is within the members of a SerialEnv, where OracleTransform does not "
                     f"reach it: write TransformedEnv(SerialEnv(...), Compose({name}(...), "
                     "OracleTransform()))"
                 )
+
+    def _is_of_this_action(self, transform: nn.Module, name: str) -> bool:
+        return unravel_key(getattr(transform, name, self.action_key)) == self.action_key
 
     def _changes_units(self, transform: object) -> bool:
         if isinstance(transform, (Compose, DTypeCastTransform, DeviceCastTransform)):

@@ -91,13 +91,19 @@ class RobustController:
             with an ``L1Transform`` as its last transform: ``env.rollout(1000, robust.policy)``.
         """
         config = self.settings(preset)
-        env = TransformedEnv(vector_environment(env), auto_unwrap=True)
+        env = TransformedEnv(self._joined(env), auto_unwrap=True)
         for transform in [
             *policy_transforms(self.policy, lambda: env),
             L1Transform(self.model, config),
         ]:
             env.append_transform(transform)
         return env
+
+    def _joined(self, env: EnvBase) -> EnvBase:
+        """With the parts of the observation in the policy's order, if they are not joined yet."""
+        there = env.full_observation_spec.get("observation", None)
+        is_whole = there is not None and there.shape[-1] == self.model.observation_dim
+        return vector_environment(env, () if is_whole else self.source.observation_keys)
 
     def settings(self, preset: str | None) -> L1Config:
         """The settings of a preset; those that act by default if ``None``.
