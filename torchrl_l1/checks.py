@@ -47,9 +47,11 @@ def check_not_negative(name: str, value: float) -> None:
 
 
 def check_count(name: str, value: int) -> None:
-    """Refuse a count below one, with a ``ValueError``."""
+    """Refuse a count below one, or one that is no integer, with a ``ValueError``."""
     if not 1 <= value < math.inf:
         raise ValueError(f"{name} must be at least 1, got {value}")
+    if isinstance(value, float):  # such as 1e3
+        raise ValueError(f"{name} must be an integer, got {value}")
 
 
 def check_counts(settings: object, *names: str, prefix: str = "") -> None:

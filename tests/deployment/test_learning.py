@@ -5,12 +5,18 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torchrl.data import Bounded, Unbounded
+from torchrl.data import Bounded, LazyTensorStorage, ReplayBuffer, Unbounded
 from torchrl.envs import GymEnv, SerialEnv
 
 from torchrl_l1.deployment import Exploration, environment_source, load_policy, target_switch_rate
 from torchrl_l1.deployment.assessment import run_episodes, summarize_episodes
-from torchrl_l1.deployment.learning import collect, epsilon_for, switch_rates
+from torchrl_l1.deployment.learning import (
+    agreed_time_step,
+    collect,
+    epsilon_for,
+    recorded,
+    switch_rates,
+)
 from torchrl_l1.dynamics import EnsembleDynamics
 
 from .conftest import balance
@@ -135,3 +141,25 @@ def test_actions_beyond_the_bounds_are_told():
     with pytest.warns(UserWarning, match="10 of 10 actions .* beyond the environment's bounds"):
         data = run_episodes(source, policy, {}, [], 2, 5, 0)
     assert (data["action"] == 3.5).all()
+
+
+def test_another_time_step_is_noticed_before_anything_is_done():
+    source = environment_source("inverted_pendulum")
+    assert agreed_time_step(source, None) == agreed_time_step(source, 0.04) == 0.04
+    with pytest.raises(ValueError, match=r"dt=0.05 was given, but a step of inverted_p.* 0.04 s"):
+        agreed_time_step(source, 0.05)
+    count = torch.arange(20.0)[:, None].expand(20, 4)
+    data = TensorDict(
+        {"observation": count, "action": count[:, :1], "next": {"observation": count + 1}},
+        batch_size=[20],
+    )
+    for step, right in ((0.04, True), (0.0405, True), (0.02, False)):
+        kept = data.clone().set("dt", torch.full((20, 1), step))
+        buffer = ReplayBuffer(storage=LazyTensorStorage(20))
+        buffer.extend(kept)
+        for form in (kept, [kept], buffer):
+            if right:
+                assert recorded(form, source.one(), 0.04).numel() == 20
+            else:
+                with pytest.raises(ValueError, match=r"with steps of 0.02 s, .* takes 0.04 s"):
+                    recorded(form, source.one(), 0.04)

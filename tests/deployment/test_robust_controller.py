@@ -229,6 +229,8 @@ def test_a_wrapped_environment_has_the_parts_in_that_order_too():
     robust = RobustController(source, policy, EnsembleDynamics(2, 1, hidden=(4,)), configs)
     for env in (GymWrapper(Parts()), source.one()):
         assert robust.wrap(env).reset()["observation"].tolist() == [2.0, 1.0]
+    with pytest.raises(TypeError, match=r"Parts is an environment of Gymnasium: .*GymWrapper"):
+        robust.wrap(Parts())
 
 
 def test_targets_that_are_none(tmp_path):

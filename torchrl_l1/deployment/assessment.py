@@ -49,6 +49,11 @@ def disturbance_cells(disturbances: Disturbances) -> list[dict[str, float]]:
     """
     if isinstance(disturbances, str):
         return suite(disturbances)
+    if not isinstance(disturbances, Mapping):
+        raise ValueError(
+            "disturbances are values by name, such as {'bias': [0.5, 1.0]}, or a suite, 'quick', "
+            f"got {disturbances!r}"
+        )
     cells: list[dict[str, float]] = [{}]
     for name, values in disturbances.items():
         if name not in DISTURBANCES:

@@ -242,21 +242,55 @@ def _transforms(env: EnvBase) -> Iterator[torch.nn.Module]:
         env = env.base_env
 
 
+def agreed_time_step(source: EnvironmentSource, dt: float | None) -> float:
+    """Time of a step in seconds, as given or else as the environment tells.
+
+    Raises:
+        ValueError: if it is not known, or the environment tells another.
+    """
+    name, told = source.name or "the environment", source.time_step()
+    if dt is None:
+        if told is None:
+            raise ValueError(
+                f"{name} does not tell the time of its steps: give dt (--dt), in seconds"
+            )
+        return told
+    if told is not None and abs(dt - told) > 1e-4 * told:
+        raise ValueError(
+            f"dt={dt:.6g} was given, but a step of {name} takes {told:.6g} s: leave dt out"
+        )
+    return dt
+
+
 def recorded(
-    data: TensorDictBase | ReplayBuffer | Sequence[TensorDictBase], env: EnvBase
+    data: TensorDictBase | ReplayBuffer | Sequence[TensorDictBase], env: EnvBase, dt: float
 ) -> TensorDictBase:
     """Recorded steps in the form of :func:`collect`'s, what is no transition left out.
 
     Args:
         data: undisturbed transitions, see :func:`~torchrl_l1.dynamics.read_transitions`.
         env: the environment that they are of.
+        dt: time of its steps in seconds; that of the data, where these hold one, may differ by
+            2 %, as clocks do.
 
     Returns:
         ``[rows, T]``, float32.
 
     Raises:
-        ValueError: if widths are not the environment's, or there are too few of them.
+        ValueError: if widths or the time of a step are not the environment's, or there are too few
+            transitions.
     """
+    held = data
+    if isinstance(data, ReplayBuffer):
+        held = data[:] if len(data) else []
+    for part in [held] if isinstance(held, TensorDictBase) else held:
+        step = part.get("dt", None) if isinstance(part, TensorDictBase) else None
+        taken = dt if step is None else float(step.double().median())
+        if abs(taken - dt) > 0.02 * dt:
+            raise ValueError(
+                f"the data were recorded with steps of {taken:.4g} s, and the environment takes "
+                f"{dt:.4g} s: resample them, or let its steps be as long"
+            )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the fit, which reads them too, says what it drops
         found = read_transitions(data, dtype=torch.float32)

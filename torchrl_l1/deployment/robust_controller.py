@@ -22,6 +22,7 @@ from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.control.layout import Layout
 from torchrl_l1.deployment.assessment import Assessment, Disturbances, assess
 from torchrl_l1.deployment.learning import (
+    agreed_time_step,
     check_surroundings,
     collect,
     epsilon_for,
@@ -101,7 +102,7 @@ class RobustController:
 
     def _joined(self, env: EnvBase) -> EnvBase:
         """With the parts of the observation in the policy's order, if they are not joined yet."""
-        there = env.full_observation_spec.get("observation", None)
+        there = getattr(env, "full_observation_spec", {}).get("observation", None)
         is_whole = there is not None and there.shape[-1] == self.model.observation_dim
         return vector_environment(env, () if is_whole else self.source.observation_keys)
 
@@ -341,8 +342,8 @@ def robustify(
 
     Raises:
         ValueError: for a setting out of its domain, an environment that does not tell its time
-            step or has a controller already, observations and actions that are no vectors, or a
-            policy whose actions do not fit.
+            step, tells another or has a controller already, observations and actions that are no
+            vectors, or a policy whose actions do not fit.
 
     Examples:
         >>> from torchrl_l1.dynamics import FitConfig
@@ -361,12 +362,7 @@ def robustify(
         check_positive("dt", dt)
     with _private_randomness():  # environments may draw a seed as they are made
         source = _source(make_env, policy)
-        dt = source.time_step() if dt is None else dt
-    if dt is None:
-        raise ValueError(
-            f"{source.name or 'the environment'} does not tell the time of its steps: give dt "
-            "(--dt), in seconds"
-        )
+        dt = agreed_time_step(source, dt)
     with _private_randomness():
         env = source.one()
         check_surroundings(env)
@@ -378,7 +374,7 @@ def robustify(
             warn_of_disturbances(env)
             data = found
         else:
-            found = recorded(data, env)
+            found = recorded(data, env, dt)
         with _bar("fit", "epoch", progress) as bar:
             dynamics = fit_dynamics(
                 data, config=fit or FIT, seed=seed, on_epoch=lambda _: bar.update(),

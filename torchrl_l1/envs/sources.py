@@ -298,8 +298,12 @@ def vector_environment(env: EnvBase, keys: Sequence[str] = ()) -> EnvBase:
             or, where that is no part, all.
 
     Raises:
+        TypeError: for an environment of Gymnasium.
         ValueError: if it has no such observation or action.
     """
+    if isinstance(env, gymnasium.Env):
+        name = type(env).__name__
+        raise TypeError(f"{name} is an environment of Gymnasium: torchrl.envs.GymWrapper wraps it")
     actions = list(env.full_action_spec.keys(True, True))
     action = env.full_action_spec["action"] if actions == ["action"] else None
     continuous = isinstance(action, (Bounded, Unbounded)) and action.dtype.is_floating_point
