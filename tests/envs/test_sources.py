@@ -177,3 +177,13 @@ def test_dm_control():
     data = source.one().rollout(2)
     parts = torch.cat([data["position"], data["velocity"]], -1).float()
     torch.testing.assert_close(data["observation"], parts)
+
+
+def test_spaces_that_torchrl_cannot_wrap_are_named():
+    class Mixed(InParts):
+        action_space = gymnasium.spaces.Tuple(
+            (gymnasium.spaces.Box(-1, 1, (1,)), gymnasium.spaces.Discrete(2))
+        )
+
+    with pytest.raises(ValueError, match=r"returns a Mixed, which TorchRL cannot .* Tuple\(Box"):
+        environment_source(Mixed).one()

@@ -246,7 +246,13 @@ def _made(function: Callable[[], Any], name: str = "the function") -> EnvBase:
     """What a function makes, as an environment of TorchRL."""
     made = function()
     if isinstance(made, gymnasium.Env):
-        return GymWrapper(made)
+        try:
+            return GymWrapper(made)
+        except RuntimeError as error:  # of spaces that are mixtures
+            raise ValueError(
+                f"{name} returns a {type(made).__name__}, which TorchRL cannot wrap ({error}): its "
+                f"actions are {made.action_space}, its observations {made.observation_space}"
+            ) from error
     if isinstance(made, Task):
         return BatchedMujocoEnv(made, 1)
     if not isinstance(made, EnvBase):
@@ -392,5 +398,6 @@ def simulation_of(env: EnvBase) -> Any:
     """Gymnasium's environment with MuJoCo's ``model`` and ``data``, if it is one; else ``None``."""
     while isinstance(env, TransformedEnv):
         env = env.base_env
-    inner = getattr(getattr(env, "_env", None), "unwrapped", None)
+    # Not getattr, by which a batch asks its members.
+    inner = getattr(env.__dict__.get("_env"), "unwrapped", None)
     return inner if isinstance(getattr(inner, "model", None), mujoco.MjModel) else None
