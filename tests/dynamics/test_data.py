@@ -172,6 +172,24 @@ def test_other_encodings_are_named(tmp_path: Path) -> None:
         read_csv(file, **KEYS)
 
 
+@pytest.mark.parametrize("name", ["done", "Terminals", "timeouts", "truncations", "is_terminal"])
+def test_ends_of_episodes_are_not_passed_over(tmp_path: Path, name: str) -> None:
+    """Read as one episode, the step from its end to the next start would be the plant's."""
+    ends = np.array([0, 0, 1, 0, 0, 1])
+    columns = {"angle": [0.0, 1, 2, 9, 8, 7], "rate": np.ones(6), "torque": np.ones(6)}
+    rows = [",".join(map(str, row)) for row in zip(*columns.values(), ends, strict=True)]
+    table = write(tmp_path / "log.csv", f"angle,rate,torque,{name}", *rows)
+    np.savez(tmp_path / "log.npz", **columns, **{name: ends.astype(bool)}, number=ends.cumsum())
+    message = rf"tells by '{name}' of 1 episodes that end before the last row"
+    for read, file in ((read_csv, table), (read_npz, tmp_path / "log.npz")):
+        with pytest.raises(ValueError, match=message):
+            read(file, **KEYS)
+    assert len(read_npz(tmp_path / "log.npz", **KEYS, episode="number")) == 3
+    # One that only says that the log ends is no hindrance.
+    rows[2] = rows[2][:-1] + "False"
+    assert len(read_csv(write(table, f"angle,rate,torque,{name}", *rows), **KEYS)) == 5
+
+
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"log\.csv: no such file"):
         read_csv(tmp_path / "log.csv", **KEYS)
