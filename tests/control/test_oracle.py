@@ -17,6 +17,7 @@ from torchrl.envs import (
     Compose,
     DoubleToFloat,
     GymEnv,
+    RenameTransform,
     SerialEnv,
     Transform,
     TransformedEnv,
@@ -215,3 +216,15 @@ def test_a_disturbance_of_another_action_is_none_of_its_business() -> None:
     after = env.step(env.reset().update({"action": ONES, "other": 2 * ONES}))["next"]
     assert after["l1", "u_exec"].unique().tolist() == [0.75]
     assert after["beside", "u_exec"].unique().tolist() == [1.5]
+
+
+def test_bounds_are_those_where_it_stands() -> None:
+    scaling, received = ActionScaling(), Received()
+    base = BatchedMujocoEnv("inverted_pendulum", 3, seed=0)  # which takes three to either side
+    env = TransformedEnv(base, Compose(received, scaling, shifted(0.9), OracleTransform()))
+    assert stepped(env, -0.8)["next", "l1", "u_exec"].unique().tolist() == [-1.0]
+    torch.testing.assert_close(received.last, torch.full((3, 1), 3 * (-1.0 + 0.9)))
+    renamed = RenameTransform([], [], ["action"], ["torque"])
+    env = TransformedEnv(base, Compose(renamed, OracleTransform("torque")))
+    data = env.step(env.reset().set("torque", 5 * ONES))
+    assert data["next", "l1", "u_exec"].unique().tolist() == [3.0]

@@ -13,6 +13,7 @@ from torchrl.data import Bounded, Unbounded
 from torchrl.envs import GymEnv
 from torchrl.modules import LSTMModule
 
+from torchrl_l1.control import L1Controller
 from torchrl_l1.deployment import (
     FunctionPolicy,
     environment_source,
@@ -388,3 +389,10 @@ def test_modules_in_train_mode(env):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         load_policy(policy.eval(), env)
+
+
+def test_a_policy_with_a_controller_is_refused(env):
+    actor = TensorDictModule(balance, ["observation"], ["action"])
+    controller = L1Controller(lambda x, u: x * u, dt=0.04, observation_dim=4, action_dim=1)
+    with pytest.raises(ValueError, match="has an L1Controller of its own"):
+        load_policy(TensorDictSequential(actor, controller), env)

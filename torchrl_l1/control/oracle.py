@@ -125,11 +125,9 @@ class OracleTransform(Transform):
         return tensordict_reset.set((self.key, "u_exec"), nothing)
 
     def _action_spec(self) -> TensorSpec:
-        # That of the actuators, whatever transforms make of it on the way to the policy.
-        environment = self._environment()
-        while isinstance(environment, TransformedEnv):
-            environment = environment.base_env
-        return environment.full_action_spec[self.action_key]
+        # In the units of what is sent from here, whatever later transforms make of them.
+        self._environment()
+        return self.parent.full_action_spec[self.action_key]
 
     def _environment(self) -> EnvBase:
         try:

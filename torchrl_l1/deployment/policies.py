@@ -23,6 +23,7 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, TensorDictPrimer
 from torchrl.modules.utils import get_primers_from_module
 
+from torchrl_l1.control import L1Controller
 from torchrl_l1.envs import load_attribute
 from torchrl_l1.envs.references import require
 from torchrl_l1.experiment.checkpoints import kept_by
@@ -315,6 +316,8 @@ def _check_mode(policy: nn.Module) -> None:
 
 def _check_keys(policy: TensorDictModuleBase, env: EnvBase) -> None:
     """Refuse a module that reads what the environment has not, or writes no action."""
+    if any(isinstance(module, L1Controller) for module in policy.modules()):
+        raise ValueError("the policy has an L1Controller of its own: give the actor without it")
     if "action" not in unravel_key_list(policy.out_keys):
         raise ValueError(
             f"the policy writes {list(policy.out_keys)} and no 'action': wrap it in a module that "

@@ -160,9 +160,9 @@ def read_npz(
             raise ValueError(f"{path}: {names} have lengths {sorted(lengths)}, expected one length")
         return torch.cat(parts, -1)
 
-    for name, values in arrays.items() if episode is None and time is None else ():
-        if _is_end(name) and values.dtype.kind in "fiub":
-            _check_ends(str(path), name, values.reshape(-1) != 0)
+    for key, flags in arrays.items() if episode is None and time is None else ():
+        if _is_end(key) and flags.dtype.kind in "fiub":
+            _check_ends(str(path), key, flags.reshape(-1) != 0)
     x, u = side_by_side(observation), side_by_side(action)
     if len(x) == len(u) + 1:
         u = torch.cat([u, u.new_zeros(1, u.shape[-1])])
