@@ -454,6 +454,24 @@ def test_a_model_that_cannot_be_called_is_named(model, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_a_model_that_writes_to_its_inputs_is_named(mode):
+    def clips(x, u):
+        return 0.1 * x.clamp_(-9.0, 9.0) + u
+
+    def centres(x, u):
+        u -= 0.5
+        return 0.1 * x + u
+
+    with mode():
+        # In inference mode nothing counts writes that change nothing.
+        for model, name in ((clips, "observation"), (centres, "action"))[
+            mode is not torch.no_grad :
+        ]:
+            with pytest.raises(ValueError, match=f"{model.__name__} writes to its {name} in place"):
+                pendulum(model).rollout(2)
+
+
 @pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
 def test_a_frozen_module_of_torchscript_has_no_mode_and_is_taken():
     plain = Joined()
