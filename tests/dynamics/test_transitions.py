@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 
 import gymnasium
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -105,6 +106,8 @@ def test_trajectories_are_never_torn_where_there_are_enough() -> None:
     assert torch.equal(read.validation, read_transitions(data, validation_fraction=0.2).validation)
     other = read_transitions(data, validation_fraction=0.2, seed=1).validation
     assert not torch.equal(read.validation, other)
+    same = read_transitions(data, validation_fraction=0.2, seed=np.int64(1)).validation
+    assert torch.equal(other, same)
 
 
 def test_trajectories_that_are_named_stay_whole_when_shuffled() -> None:

@@ -379,7 +379,7 @@ def _hold_out(groups: Tensor, fraction: float, seed: int) -> Tensor:
         piece = max(1, min(wanted, count - wanted, max(_PIECE, wanted // 5)))
         pieces = groups * (count // piece + 1) + rank // piece
         groups, sizes = pieces.unique(return_inverse=True, return_counts=True)[1:]
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(int(seed))
     order = torch.randperm(len(sizes), generator=generator).to(groups.device)
     before = sizes[order].cumsum(0) - sizes[order]
     # Never all of them.
