@@ -97,6 +97,10 @@ class ActionJacobian:
     ) -> None:
         if predicts not in (None, "change", "next_observation"):
             raise ValueError(f"predicts must be 'change' or 'next_observation', got {predicts!r}")
+        if isinstance(dynamics, type):
+            raise TypeError(
+                f"dynamics is the class {dynamics.__name__}: give a model, {dynamics.__name__}(...)"
+            )
         self.dynamics = dynamics
         self.ensemble_dim = ensemble_dim
         self.analytic = callable(getattr(dynamics, "value_and_jacobian", None))
