@@ -117,6 +117,8 @@ def test_intervals(interval: str, inside: list[float], outside: list[float]) -> 
 def test_errors_name_the_setting_and_what_it_may_be() -> None:
     with pytest.raises(ValueError, match=r"^fit.patience must be at least 1, got 0$"):
         check_count("fit.patience", 0)
+    with pytest.raises(ValueError, match=r"^steps must be an integer, got 1000.0$"):
+        check_count("steps", 1e3)
     with pytest.raises(ValueError, match=r"^policy.hidden must hold widths .* got \[8, 0\]$"):
         check_widths("policy.hidden", [8, 0])
     with pytest.raises(ValueError, match=r"^label must be 'one' or 'two', got 'three'$"):

@@ -47,9 +47,11 @@ def check_not_negative(name: str, value: float) -> None:
 
 
 def check_count(name: str, value: int) -> None:
-    """Refuse a count below one, with a ``ValueError``."""
+    """Refuse a count below one, or one that is no integer, with a ``ValueError``."""
     if not 1 <= value < math.inf:
         raise ValueError(f"{name} must be at least 1, got {value}")
+    if isinstance(value, float):  # such as 1e3
+        raise ValueError(f"{name} must be an integer, got {value}")
 
 
 def check_counts(settings: object, *names: str, prefix: str = "") -> None:
@@ -59,9 +61,11 @@ def check_counts(settings: object, *names: str, prefix: str = "") -> None:
 
 
 def check_optional_count(name: str, value: int | None) -> None:
-    """Refuse a count that is neither null nor at least one, with a ``ValueError``."""
+    """Refuse a count that is neither null nor an integer of at least one: a ``ValueError``."""
     if value is not None and not 1 <= value < math.inf:
         raise ValueError(f"{name} must be at least 1 or null, got {value}")
+    if isinstance(value, float):
+        raise ValueError(f"{name} must be an integer or null, got {value}")
 
 
 def check_widths(name: str, widths: Sequence[int]) -> None:

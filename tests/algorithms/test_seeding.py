@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 from torchrl_l1.algorithms.collection import seed_streams, stream_seed
@@ -10,6 +11,8 @@ def test_streams_are_reproducible_and_distinct() -> None:
     seeds = {stream_seed(run, *name) for run in range(50) for name in names}
     assert len(seeds) == 200
     assert all(0 <= seed < 2**63 for seed in seeds)
+    # As of np.arange, or of a tensor, it is the same number.
+    assert stream_seed(np.int64(3), "x") == stream_seed(torch.tensor(3), "x") == stream_seed(3, "x")
 
 
 def test_seeding_restarts_torch() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import (
     CatFrames,
@@ -24,8 +24,17 @@ from torchrl.envs import (
     VecNormV2,
 )
 
-from tests.control.compositions import BOTH, Identity, Pipeline, model, normaliser, pendulum, two
-from torchrl_l1.control import L1Controller, L1Transform, init
+from tests.control.compositions import (
+    BOTH,
+    Identity,
+    Pipeline,
+    actor,
+    model,
+    normaliser,
+    pendulum,
+    two,
+)
+from torchrl_l1.control import L1Config, L1Controller, L1Transform, OracleTransform, init
 from torchrl_l1.envs import (
     ActionNoise,
     ActuatorBias,
@@ -59,6 +68,13 @@ class OverwritesAfterSteps(Overwrites):
 class WritesInPlace(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         return observation.mul_(0.999)
+
+
+class Pushes(nn.Linear):
+    """A model that looks at the action only."""
+
+    def forward(self, x: Tensor, u: Tensor) -> Tensor:
+        return super().forward(u)
 
 
 class Repeats(Transform):
@@ -344,3 +360,76 @@ def test_without_a_seal_the_controller_trusts() -> None:
         observation=torch.ones(2, 3), action=torch.ones(2, 1), l1=nested, batch_size=[2]
     )
     assert controller(data)["next", "l1", "started"].all()
+
+
+@pytest.mark.parametrize("face", [L1Transform, L1Controller, OracleTransform])
+def test_entries_are_under_one_name(face: type) -> None:
+    settings = {} if face is OracleTransform else {"dynamics": model, "dt": 0.05}
+    with pytest.raises(TypeError, match=rf"{face.__name__} keeps .* must be a str, got \('agen"):
+        face(key=("agents", "l1"), **settings)
+
+
+def test_a_model_converted_to_another_type_is_noticed() -> None:
+    dynamics = Pushes(1, 3)
+    l1 = L1Transform(dynamics, dt=0.05)
+    dynamics.double()  # before the environment is there it is no matter
+    env = TransformedEnv(pendulum(), l1)
+    data = env.rollout(3)
+    assert data["l1", "x_hat"].dtype == torch.float64
+    dynamics.float()
+    with pytest.raises(ValueError, match=r"model is of torch.float32 and was of torch.float64"):
+        env.reset()
+
+
+def controller(**settings: Any) -> L1Controller:
+    dims = {"observation_dim": 3, "action_dim": 1}
+    return L1Controller(model, **{"dt": 0.05, **dims, **settings})
+
+
+def test_two_faces_under_one_name_are_refused() -> None:
+    l1, ours = partial(L1Transform, model, dt=0.05), controller()
+    for chain in ((l1(), ours.make_primer()), (controller().make_primer(), ours.make_primer())):
+        with pytest.raises(ValueError, match="under 'l1' already, of another controller or primer"):
+            TransformedEnv(pendulum(), Compose(*chain)).reset()
+    # Collectors may add a second primer of one controller.
+    twice = TransformedEnv(pendulum(), Compose(ours.make_primer(), ours.make_primer()))
+    policy = TensorDictSequential(actor(), ours)
+    once = TransformedEnv(pendulum(), ours.make_primer())
+    for env in (twice, once):
+        env.set_seed(0)
+    data, expected = (env.rollout(5, policy) for env in (twice, once))
+    assert torch.equal(data["next", "l1", "x_hat"], expected["next", "l1", "x_hat"])
+
+
+def test_a_controller_that_is_applied_twice_is_noticed() -> None:
+    ours = controller()
+    env = TransformedEnv(pendulum(), ours.make_primer())
+    with pytest.raises(ValueError, match="applied again to 'action', its own output"):
+        env.rollout(2, TensorDictSequential(actor(), ours, ours))
+
+
+def test_the_primer_of_other_settings_is_told() -> None:
+    other = controller(config=L1Config.robust(0.05), dt=None)
+    env = TransformedEnv(pendulum(), other.make_primer())
+    mine = controller(action_low=-2.0, action_high=2.0)
+    with pytest.raises(ValueError, match="is that of an L1 with other settings or widths"):
+        env.rollout(2, TensorDictSequential(actor(), mine))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: L1Transform(model, 0.05),
+            r"L1Transform takes an L1Config .* got 0\.05: .* dt=0\.05",
+        ),
+        (lambda: controller(config={"dt": 0.05}, dt=None), "L1Controller takes an L1Config"),
+        (
+            lambda: L1Transform(Pushes, dt=0.05),
+            r"is the class Pushes: give a model, Pushes\(\.\.\.\)",
+        ),
+    ],
+)
+def test_arguments_of_another_kind_are_named(make: Any, message: str) -> None:
+    with pytest.raises(TypeError, match=message):
+        make()

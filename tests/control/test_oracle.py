@@ -11,20 +11,23 @@ from hypothesis import strategies as st
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data import Composite, LazyTensorStorage, ReplayBuffer
 from torchrl.envs import (
     ActionScaling,
     Compose,
     DoubleToFloat,
     GymEnv,
+    RenameTransform,
     SerialEnv,
     Transform,
     TransformedEnv,
 )
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_l1.control import OracleTransform
-from torchrl_l1.envs import ActionNoise, BatchedMujocoEnv, make_env
+from torchrl_l1.control import L1Transform, OracleTransform
+from torchrl_l1.envs import ActionNoise, ActuatorBias, BatchedMujocoEnv, make_env
+
+ONES = torch.ones(3, 1)
 
 
 class Disturbed(Transform):
@@ -176,3 +179,52 @@ def test_stored_data_are_refused() -> None:
         buffer.extend(data)
     with pytest.raises(RuntimeError, match="'u_exec'"):
         OracleTransform()(data)
+
+
+@pytest.mark.parametrize("outside", [False, True])
+def test_another_controller_beside_it_is_refused(outside: bool) -> None:
+    def push(x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat([u, -u, u, -u], -1)
+
+    for other in (OracleTransform(key="first"), L1Transform(push, dt=0.04, key="first")):
+        env, _ = environment(shifted(0.5), other)
+        if outside:
+            env = TransformedEnv(env, OracleTransform(), auto_unwrap=False)
+        else:
+            env.append_transform(OracleTransform())
+        name = type(other).__name__
+        with pytest.raises(ValueError, match=f"{name} is there beside OracleTransform"):
+            env.reset()
+
+
+def test_disturbances_within_the_members_of_a_batch_are_out_of_reach() -> None:
+    def member() -> TransformedEnv:
+        return TransformedEnv(GymEnv("InvertedPendulum-v5"), shifted(0.5))
+
+    env = TransformedEnv(SerialEnv(2, member), OracleTransform())
+    with pytest.raises(ValueError, match=r"Disturbed is within the members of a SerialEnv.*write"):
+        env.reset()
+
+
+def test_a_disturbance_of_another_action_is_none_of_its_business() -> None:
+    plain = BatchedMujocoEnv("inverted_pendulum", 3, seed=0)
+    actuator = plain.action_spec.clone()
+    plain.action_spec = Composite(action=actuator, other=actuator.clone(), shape=[3])
+    chain = ActuatorBias(0.5, "other"), ActuatorBias(0.25), OracleTransform()
+    env = TransformedEnv(plain, Compose(*chain))
+    env.append_transform(OracleTransform("other", key="beside"))
+    after = env.step(env.reset().update({"action": ONES, "other": 2 * ONES}))["next"]
+    assert after["l1", "u_exec"].unique().tolist() == [0.75]
+    assert after["beside", "u_exec"].unique().tolist() == [1.5]
+
+
+def test_bounds_are_those_where_it_stands() -> None:
+    scaling, received = ActionScaling(), Received()
+    base = BatchedMujocoEnv("inverted_pendulum", 3, seed=0)  # which takes three to either side
+    env = TransformedEnv(base, Compose(received, scaling, shifted(0.9), OracleTransform()))
+    assert stepped(env, -0.8)["next", "l1", "u_exec"].unique().tolist() == [-1.0]
+    torch.testing.assert_close(received.last, torch.full((3, 1), 3 * (-1.0 + 0.9)))
+    renamed = RenameTransform([], [], ["action"], ["torque"])
+    env = TransformedEnv(base, Compose(renamed, OracleTransform("torque")))
+    data = env.step(env.reset().set("torque", 5 * ONES))
+    assert data["next", "l1", "u_exec"].unique().tolist() == [3.0]

@@ -33,6 +33,17 @@ class Model(nn.Module):
         return self.out(h.flatten(1)).reshape(x.shape)
 
 
+class Joined(nn.Module):
+    """A layer on observation and action side by side."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Linear(N + M, N)
+
+    def forward(self, x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        return self.layer(torch.cat([x, u], -1)).tanh()
+
+
 def attention(**settings) -> nn.Module:
     return nn.TransformerEncoderLayer(8, 2, 16, **{"dropout": 0.0, "batch_first": True, **settings})
 
@@ -425,3 +436,46 @@ def test_a_residual_covariance_that_varies_needs_to_be_remembered():
         step(init([5], 3, 3, config), x, u)
     same = ActionJacobian(WithCovariance(lambda x: torch.eye(3).expand(*x.shape, 3)))
     make_step(ROBUST, same, False)(init([5], 3, 3, ROBUST), x, u)
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (nn.Sequential(nn.Linear(4, 3)), "model Sequential failed .* two arguments.*TypeError"),
+        (nn.ModuleList([nn.Linear(4, 3)]), "model ModuleList failed .*NotImplementedError"),
+        (nn.Bilinear(3, 2, 3), r"observation of shape \(3,\) .* action of shape \(1,\)"),
+        (lambda both: both, "lambda> failed at its first call"),
+        (nn.Bilinear(3, 1, 3).double(), "both torch.float32, .*RuntimeError"),
+    ],
+)
+def test_a_model_that_cannot_be_called_is_named(model, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        pendulum(model, dtype=torch.float32).rollout(2)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_a_model_that_writes_to_its_inputs_is_named(mode):
+    def clips(x, u):
+        return 0.1 * x.clamp_(-9.0, 9.0) + u
+
+    def centres(x, u):
+        u -= 0.5
+        return 0.1 * x + u
+
+    with mode():
+        # In inference mode nothing counts writes that change nothing.
+        for model, name in ((clips, "observation"), (centres, "action"))[
+            mode is not torch.no_grad :
+        ]:
+            with pytest.raises(ValueError, match=f"{model.__name__} writes to its {name} in place"):
+                pendulum(model).rollout(2)
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
+def test_a_frozen_module_of_torchscript_has_no_mode_and_is_taken():
+    plain = Joined()
+    frozen = torch.jit.freeze(torch.jit.script(plain).eval())
+    x, u = data(4)
+    for ours, theirs in zip(ActionJacobian(frozen)(x, u), ActionJacobian(plain)(x, u), strict=True):
+        torch.testing.assert_close(ours, theirs)

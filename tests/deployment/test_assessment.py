@@ -27,6 +27,8 @@ def test_cells():
         disturbance_cells({"wobble": [1.0]})
     with pytest.raises(ValueError, match="unknown suite"):
         disturbance_cells("slow")
+    with pytest.raises(ValueError, match=r"disturbances are values by name, .* got None"):
+        disturbance_cells(None)
     with pytest.raises(ValueError, match="finite"):
         disturbance_cells({"bias": float("nan")})
 

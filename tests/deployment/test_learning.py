@@ -5,10 +5,18 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torchrl.data import Bounded, Unbounded
+from torchrl.data import Bounded, LazyTensorStorage, ReplayBuffer, Unbounded
+from torchrl.envs import GymEnv, SerialEnv
 
 from torchrl_l1.deployment import Exploration, environment_source, load_policy, target_switch_rate
-from torchrl_l1.deployment.learning import collect, epsilon_for, switch_rates
+from torchrl_l1.deployment.assessment import run_episodes, summarize_episodes
+from torchrl_l1.deployment.learning import (
+    agreed_time_step,
+    collect,
+    epsilon_for,
+    recorded,
+    switch_rates,
+)
 from torchrl_l1.dynamics import EnsembleDynamics
 
 from .conftest import balance
@@ -93,3 +101,65 @@ def test_epsilon_gives_the_rate_that_is_asked_for(rate):
 
 def test_the_rule_of_thumb_changes_at_five_entries():
     assert [target_switch_rate(n) for n in (1, 4, 5, 18)] == [50.0, 50.0, 350.0, 350.0]
+
+
+@pytest.mark.parametrize(
+    ("act", "message"),
+    [
+        (lambda x: x[..., 0], r"action of shape \[3\] for 3 environments .* expected \[3, 1\]"),
+        (lambda x: x[..., None, :1], r"action of shape \[3, 1, 1\]"),
+        (
+            torch.nn.Linear(4, 1).double(),
+            r"failed at its first call, .* \[3, 4\] .*: mat1 ",
+        ),
+    ],
+)
+def test_actions_that_do_not_fit_never_reach_the_environment(act, message):
+    policy = TensorDictModule(act, ["observation"], ["action"])
+    source = environment_source("inverted_pendulum")
+    with pytest.raises(ValueError, match=message):
+        collect(source, policy, 30, 3, 0.3, 0)
+    with pytest.raises(ValueError, match=message):
+        run_episodes(source, policy, {}, [], 3, 10, 0)
+
+
+def test_environments_in_rows_and_columns_are_laid_side_by_side():
+    def grid():
+        return SerialEnv(2, lambda: SerialEnv(3, lambda: GymEnv("Pendulum-v1")))
+
+    source = environment_source(grid)
+    policy = TensorDictModule(lambda x: -x[..., 1:2], ["observation"], ["action"])
+    data = collect(source, policy, 60, 1, 0.3, 0)
+    assert data.shape == (6, 10)
+    assert torch.equal(data["observation"][:, 1:], data["next", "observation"][:, :-1])
+    assert len(summarize_episodes(run_episodes(source, policy, {}, [], 1, 7, 0)).returns) == 6
+
+
+def test_actions_beyond_the_bounds_are_told():
+    source = environment_source("inverted_pendulum")
+    policy = TensorDictModule(lambda x: 0 * x[..., :1] + 3.5, ["observation"], ["action"])
+    with pytest.warns(UserWarning, match="10 of 10 actions .* beyond the environment's bounds"):
+        data = run_episodes(source, policy, {}, [], 2, 5, 0)
+    assert (data["action"] == 3.5).all()
+
+
+def test_another_time_step_is_noticed_before_anything_is_done():
+    source = environment_source("inverted_pendulum")
+    assert agreed_time_step(source, None) == agreed_time_step(source, 0.04) == 0.04
+    with pytest.raises(ValueError, match=r"dt=0.05 was given, but a step of inverted_p.* 0.04 s"):
+        agreed_time_step(source, 0.05)
+    count = torch.arange(20.0)[:, None].expand(20, 4)
+    data = TensorDict(
+        {"observation": count, "action": count[:, :1], "next": {"observation": count + 1}},
+        batch_size=[20],
+    )
+    for step, right in ((0.04, True), (0.0405, True), (0.02, False)):
+        kept = data.clone().set("dt", torch.full((20, 1), step))
+        buffer = ReplayBuffer(storage=LazyTensorStorage(20))
+        buffer.extend(kept)
+        for form in (kept, [kept], buffer):
+            if right:
+                assert recorded(form, source.one(), 0.04).numel() == 20
+            else:
+                with pytest.raises(ValueError, match=r"with steps of 0.02 s, .* takes 0.04 s"):
+                    recorded(form, source.one(), 0.04)

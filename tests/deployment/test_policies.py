@@ -13,6 +13,7 @@ from torchrl.data import Bounded, Unbounded
 from torchrl.envs import GymEnv
 from torchrl.modules import LSTMModule
 
+from torchrl_l1.control import L1Controller
 from torchrl_l1.deployment import (
     FunctionPolicy,
     environment_source,
@@ -372,3 +373,26 @@ def test_a_model_of_stable_baselines_brings_its_normaliser(env):
     scaled = normalized.normalize_obs(OBSERVATION.numpy())
     expected = torch.as_tensor(model.predict(scaled, deterministic=True)[0])
     torch.testing.assert_close(actions(load_policy(model, env), OBSERVATION), expected)
+
+
+def test_modules_in_train_mode(env):
+    net = torch.nn.Sequential(torch.nn.Linear(4, 4), torch.nn.BatchNorm1d(4), torch.nn.Linear(4, 1))
+    for policy in (net, TensorDictModule(net, ["observation"], ["action"])):
+        with pytest.raises(ValueError, match=r"layer .*1 \(BatchNorm1d\) mixes .*eval\(\)"):
+            load_policy(policy, env)
+    assert net[1].num_batches_tracked == 0  # nothing has been learned on the way
+    load_policy(net.eval(), env)
+    drops = torch.nn.Sequential(torch.nn.Dropout(0.5), torch.nn.Linear(4, 1))
+    policy = TensorDictModule(drops, ["observation"], ["action"])
+    with pytest.warns(UserWarning, match=r"module\.0 \(Dropout\) draws at random: call its eval"):
+        load_policy(policy, env)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_policy(policy.eval(), env)
+
+
+def test_a_policy_with_a_controller_is_refused(env):
+    actor = TensorDictModule(balance, ["observation"], ["action"])
+    controller = L1Controller(lambda x, u: x * u, dt=0.04, observation_dim=4, action_dim=1)
+    with pytest.raises(ValueError, match="has an L1Controller of its own"):
+        load_policy(TensorDictSequential(actor, controller), env)

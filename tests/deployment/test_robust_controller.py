@@ -3,17 +3,20 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import Box, Dict
 from tensordict.nn import TensorDictModule
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.envs import EnvBase, GymEnv, TransformedEnv
+from torchrl.envs import EnvBase, GymEnv, GymWrapper, TransformedEnv
 
 import torchrl_l1
-from torchrl_l1.control import L1Transform
-from torchrl_l1.deployment import RobustController, load_target, robustify
+from torchrl_l1.control import L1Config, L1Transform
+from torchrl_l1.deployment import RobustController, environment_source, load_target, robustify
 from torchrl_l1.deployment.robust_controller import _source
-from torchrl_l1.dynamics import FitConfig
+from torchrl_l1.dynamics import EnsembleDynamics, FitConfig
 from torchrl_l1.envs import ActuatorBias, make_env
 from torchrl_l1.experiment.run import run
 
@@ -212,6 +215,24 @@ def test_a_runs_policy_sees_the_parts_of_the_observation_in_its_own_order(tmp_pa
     assert _source("gymnasium/Pendulum-v1", str(tmp_path)).observation_keys == ()
 
 
+def test_a_wrapped_environment_has_the_parts_in_that_order_too():
+    class Parts(gymnasium.Env):
+        action_space = Box(-1, 1, (1,))
+        observation_space = Dict(place=Box(-9, 9, (1,)), speed=Box(-9, 9, (1,)))
+
+        def reset(self, *, seed=None, options=None):
+            return {"place": np.ones(1, np.float32), "speed": 2 * np.ones(1, np.float32)}, {}
+
+    source = replace(environment_source(Parts), observation_keys=("speed", "place"))
+    policy = TensorDictModule(lambda x: x[..., :1], ["observation"], ["action"])
+    configs = {"robust": L1Config.robust(0.05)}
+    robust = RobustController(source, policy, EnsembleDynamics(2, 1, hidden=(4,)), configs)
+    for env in (GymWrapper(Parts()), source.one()):
+        assert robust.wrap(env).reset()["observation"].tolist() == [2.0, 1.0]
+    with pytest.raises(TypeError, match=r"Parts is an environment of Gymnasium: .*GymWrapper"):
+        robust.wrap(Parts())
+
+
 def test_targets_that_are_none(tmp_path):
     with pytest.raises(ValueError, match="there is no folder"):
         load_target("gymnasium/Pendulum-v1")
@@ -225,4 +246,12 @@ def test_a_disturbance_in_the_data_is_noticed():
         return TransformedEnv(GymEnv("InvertedPendulum-v5"), ActuatorBias(0.5))
 
     with pytest.warns(UserWarning, match="brings ActuatorBias along"):
+        robustify(make, balance, 60, fit=QUICK, **TINY)
+
+
+def test_an_environment_with_a_controller_is_refused(robust):
+    def make() -> EnvBase:
+        return robust.wrap(GymEnv("InvertedPendulum-v5"))
+
+    with pytest.raises(ValueError, match="brings L1Transform along"):
         robustify(make, balance, 60, fit=QUICK, **TINY)

@@ -103,6 +103,19 @@ def test_empty_cells_and_other_habits(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("delimiter", "lines"),
+    [
+        (" ", ["angle  rate   torque", " 0.1 2      3", "4   5e-1   6 "]),
+        (",", ["", '"angle", "rate", "torque"', '"0.1", 2, 3', "4, 0.5, 6"]),
+    ],
+)
+def test_columns_padded_with_spaces(tmp_path: Path, delimiter: str, lines: list[str]) -> None:
+    data = read_csv(write(tmp_path / "log.csv", *lines), **KEYS, delimiter=delimiter)
+    assert data["observation"].tolist() == [[0.1, 2.0]] and data["action"].tolist() == [[3.0]]
+    assert data["next", "observation"].tolist() == [[4.0, 0.5]]
+
+
+@pytest.mark.parametrize(
     ("lines", "options", "error", "message"),
     [
         (["angle,rate", "0,0"], {}, KeyError, "no column 'torque', only angle, rate"),
@@ -114,6 +127,14 @@ def test_empty_cells_and_other_habits(tmp_path: Path) -> None:
             ValueError,
             "line 3, column 'rate': 'off' is no number",
         ),
+        (
+            # As R writes it, with the names of the rows; and with decimal commas.
+            ["angle,rate,torque", "1,0,0,0", "2,0,0,0"],
+            {},
+            ValueError,
+            "line 2 has 4 cells for 3 columns: there is a column without a name, or a ','",
+        ),
+        (["angle\trate\ttorque"], {"delimiter": "\\t"}, ValueError, "delimiter is one character"),
         (["angle,rate,torque,rate", "0,0,0,1"], {}, ValueError, "2 columns 'rate': rename them"),
         (["angle,rate,torque", f"{10**6 * '0'}"], {}, ValueError, "no table of text: field larger"),
         (["angle,rate,torque", "0,0,0"], {}, ValueError, "1 rows, of which none follows"),
@@ -149,6 +170,24 @@ def test_other_encodings_are_named(tmp_path: Path) -> None:
     file.write_bytes("angle,rate,torque,°C\n0,0,0,20\n".encode("cp1252"))
     with pytest.raises(ValueError, match=r"log\.csv is no text in UTF-8 .*: save it as such"):
         read_csv(file, **KEYS)
+
+
+@pytest.mark.parametrize("name", ["done", "Terminals", "timeouts", "truncations", "is_terminal"])
+def test_ends_of_episodes_are_not_passed_over(tmp_path: Path, name: str) -> None:
+    """Read as one episode, the step from its end to the next start would be the plant's."""
+    ends = np.array([0, 0, 1, 0, 0, 1])
+    columns = {"angle": [0.0, 1, 2, 9, 8, 7], "rate": np.ones(6), "torque": np.ones(6)}
+    rows = [",".join(map(str, row)) for row in zip(*columns.values(), ends, strict=True)]
+    table = write(tmp_path / "log.csv", f"angle,rate,torque,{name}", *rows)
+    np.savez(tmp_path / "log.npz", **columns, **{name: ends.astype(bool)}, number=ends.cumsum())
+    message = rf"tells by '{name}' of 1 episodes that end before the last row"
+    for read, file in ((read_csv, table), (read_npz, tmp_path / "log.npz")):
+        with pytest.raises(ValueError, match=message):
+            read(file, **KEYS)
+    assert len(read_npz(tmp_path / "log.npz", **KEYS, episode="number")) == 3
+    # One that only says that the log ends is no hindrance.
+    rows[2] = rows[2][:-1] + "False"
+    assert len(read_csv(write(table, f"angle,rate,torque,{name}", *rows), **KEYS)) == 5
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 
 import gymnasium
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -14,7 +15,7 @@ from torch import nn
 from torchrl.collectors import Collector
 from torchrl.collectors.utils import split_trajectories
 from torchrl.data import LazyTensorStorage, ListStorage, ReplayBuffer
-from torchrl.envs import GymEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import GymEnv, MultiStepTransform, SerialEnv, StepCounter, TransformedEnv
 
 from torchrl_l1.dynamics import (
     EnsembleDynamics,
@@ -105,6 +106,8 @@ def test_trajectories_are_never_torn_where_there_are_enough() -> None:
     assert torch.equal(read.validation, read_transitions(data, validation_fraction=0.2).validation)
     other = read_transitions(data, validation_fraction=0.2, seed=1).validation
     assert not torch.equal(read.validation, other)
+    same = read_transitions(data, validation_fraction=0.2, seed=np.int64(1)).validation
+    assert torch.equal(other, same)
 
 
 def test_trajectories_that_are_named_stay_whole_when_shuffled() -> None:
@@ -252,7 +255,7 @@ def test_other_keys() -> None:
             lambda d: d["next"].pop("observation"),
             {},
             KeyError,
-            r"no \('next', 'observation'\), only 'action', .*observation_key",
+            r"no \('next', 'observation'\), only 'action', .*observation_key.*one row later",
         ),
         (
             lambda d: d.set("action", torch.zeros(20)),
@@ -373,3 +376,15 @@ def test_inputs_that_never_vary_are_ignored_and_told() -> None:
         torch.testing.assert_close(model.value_and_jacobian(observation, action), (expected, gain))
     torch.testing.assert_close(gain[:, :2, 0], torch.full((5, 2), 0.1), rtol=0.0, atol=0.05)
     assert (gain[..., 1] == 0).all()
+
+
+def test_steps_of_several_are_refused() -> None:
+    """MultiStep writes what followed three steps later: a plant three times as fast."""
+    made = ReplayBuffer(
+        storage=LazyTensorStorage(100), transform=MultiStepTransform(n_steps=3, gamma=0.9)
+    )
+    made.extend(line(10).set(("next", "reward"), torch.ones(10, 1)))
+    gaps = made[:]["next", "observation"] - made[:]["observation"]
+    assert gaps.max() == 3.0
+    with pytest.raises(ValueError, match=r"'next', 'observation'\) is up to 3 steps later"):
+        read_transitions(made)

@@ -8,7 +8,7 @@ from gymnasium.spaces import Box, Dict, Discrete
 from gymnasium.wrappers import TimeLimit
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torchrl.envs import GymEnv, StepCounter, TransformedEnv
+from torchrl.envs import GymEnv, GymWrapper, SerialEnv, StepCounter, TransformedEnv
 
 from torchrl_l1.control import time_step
 from torchrl_l1.envs import ExternalTask, Task, environment_source, get_task, make_env
@@ -288,3 +288,52 @@ def test_a_package_that_gymnasium_lacks_is_named(monkeypatch):
     monkeypatch.setattr(gymnasium, "make", lacking)
     with pytest.raises(ValueError, match="gymnasium/Pendulum-v1: Box2D is not installed"):
         ExternalTask(environment_source("gymnasium/Pendulum-v1"))
+
+
+class OfGym(Cart):
+    """What Gym's environments returned before Gymnasium."""
+
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=seed)[0]
+
+
+class OfGymAtSteps(Cart):
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, reward, terminated or truncated, info
+
+
+class Scalar(Cart):
+    """An observation that NumPy would spread over all entries."""
+
+    def step(self, action):
+        return np.float32(0.5), *super().step(action)[1:]
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (OfGym, r"reset does not return \(observation, info\)"),
+        (
+            OfGymAtSteps,
+            r"step does not return \(observation, reward, terminated, ",
+        ),
+        (Scalar, r"an observation of shape \(\), and its observation space has 2 entries"),
+    ],
+)
+def test_what_an_environment_returns_must_be_what_it_says(make, words):
+    with pytest.raises(ValueError, match=words):
+        task_of(make, horizon=5).environment(2, seed=0).rollout(2)
+
+
+def test_horizons_that_are_none():
+    for horizon in (0, 2.5):
+        with pytest.raises(ValueError, match=r"horizon must be .*, got (0|2.5)"):
+            task_of(Cart, horizon=horizon)
+
+
+def test_a_batch_of_one_is_not_asked_for_its_members():
+    task = task_of(lambda: SerialEnv(1, lambda: GymWrapper(Cart())), horizon=5, dt=0.1)
+    assert not task.has_plant and task.environment(2, seed=0).rollout(3).shape == (2, 3)
+    with pytest.raises(ValueError, match="does not tell how long an episode is"):
+        task_of(lambda: SerialEnv(1, lambda: GymWrapper(Cart())), horizon=None, dt=0.1)

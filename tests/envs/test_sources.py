@@ -5,11 +5,14 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import FrameSkipTransform, GymEnv, GymWrapper, TransformedEnv
+from torchrl.envs import FrameSkipTransform, GymEnv, GymWrapper, PendulumEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
 
 from torchrl_l1.deployment import environment_source, time_step, vector_environment
 from torchrl_l1.envs import TASKS, make_env
 from torchrl_l1.envs.sources import simulation_of
+
+ONE = torch.ones(1)
 
 
 class InParts(gymnasium.Env):
@@ -93,9 +96,39 @@ def test_observations_in_parts_are_joined_in_the_order_of_their_names():
     assert data["action"].dtype == torch.float32
 
 
+class OfTwoTypes(InParts):
+    """Only the velocity is in double precision."""
+
+    observation_space = gymnasium.spaces.Dict(
+        height=gymnasium.spaces.Box(-9, 9, (), np.float32),
+        velocity=gymnasium.spaces.Box(-9, 9, (2,), np.float64),
+    )
+
+    def step(self, action):
+        return {"velocity": np.array([3.0, 4.0]), "height": np.float32(0.7)}, 1.0, False, False, {}
+
+
+def test_parts_of_two_types_are_joined_in_single_precision():
+    env = vector_environment(GymWrapper(OfTwoTypes()))
+    check_env_specs(env)
+    after = env.rollout(2)["next"]
+    assert after["observation"].dtype == torch.float32 and after["velocity"].dtype == torch.float64
+    torch.testing.assert_close(after["observation"][1], torch.tensor([0.7, 3.0, 4.0]))
+
+
+def test_environments_that_read_their_observation_again_are_joined_beside_it():
+    # TorchRL's pendulum has no state but its angle and rate, two numbers.
+    env, plain = vector_environment(PendulumEnv()), PendulumEnv()
+    env.set_seed(0), plain.set_seed(0)
+    data, expected = (one.rollout(5, lambda td: td.set("action", ONE)) for one in (env, plain))
+    both = torch.stack([expected["next", "th"], expected["next", "thdot"]], -1)
+    assert torch.equal(data["next", "observation"], both)
+
+
 def test_actions_that_are_no_vector_are_refused():
-    with pytest.raises(ValueError, match="continuous actions"):
+    with pytest.raises(ValueError, match=r"continuous actions .*'action': OneHot") as caught:
         vector_environment(GymEnv("CartPole-v1"))
+    assert "\n" not in str(caught.value)
 
 
 def test_disturbances_act_between_controller_and_environment():
@@ -144,3 +177,13 @@ def test_dm_control():
     data = source.one().rollout(2)
     parts = torch.cat([data["position"], data["velocity"]], -1).float()
     torch.testing.assert_close(data["observation"], parts)
+
+
+def test_spaces_that_torchrl_cannot_wrap_are_named():
+    class Mixed(InParts):
+        action_space = gymnasium.spaces.Tuple(
+            (gymnasium.spaces.Box(-1, 1, (1,)), gymnasium.spaces.Discrete(2))
+        )
+
+    with pytest.raises(ValueError, match=r"returns a Mixed, which TorchRL cannot .* Tuple\(Box"):
+        environment_source(Mixed).one()

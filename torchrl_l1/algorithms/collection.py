@@ -277,7 +277,7 @@ def stream_seed(seed: int, *names: str | int) -> int:
         >>> stream_seed(0, "iteration", 3) == stream_seed(0, "iteration", 4)
         False
     """
-    digest = hashlib.sha256(repr((seed, *names)).encode()).digest()
+    digest = hashlib.sha256(repr((int(seed), *names)).encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1
 
 

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import TensorDictPrimer, Transform
@@ -26,11 +27,13 @@ from torchrl_l1.control.layout import (
     advance,
     as_action_jacobian,
     declared_dimension,
+    entry_name,
     required_entry,
 )
 from torchrl_l1.control.pipeline import (
     Settings,
     carry,
+    chain_of,
     check_time_step,
     leaf_spec,
     unspecified,
@@ -50,6 +53,7 @@ class _Environment:
         self.low: Scalars | None = None
         self.high: Scalars | None = None
         self.emitted: Emitted | None = None
+        self.sent: Tensor | None = None
         self._filled: tuple[L1Config, L1Config] | None = None
 
     @property
@@ -84,7 +88,7 @@ class _Environment:
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"emitted": None}
+        return self.__dict__ | {"emitted": None, "sent": None}
 
 
 class L1Primer(TensorDictPrimer):
@@ -159,11 +163,23 @@ class L1Primer(TensorDictPrimer):
     def transform_output_spec(self, output_spec: Composite) -> Composite:
         """Add the controller's state and signals."""
         self._adopt_types()
+        is_there = output_spec["full_observation_spec"].get(self.key, None) is not None
+        if is_there and not self._has_a_twin():
+            raise ValueError(
+                f"the environment has entries under {self.key!r} already, of another controller or "
+                "primer: leave one of them out, or give L1Controller a key of its own"
+            )
         output_spec = super().transform_output_spec(output_spec)
         observation_spec = output_spec["full_observation_spec"]
         signals = self._signals.expand(observation_spec.shape).to(observation_spec.device)
         observation_spec[self.key].update(signals)
         return output_spec
+
+    def _has_a_twin(self) -> bool:
+        """Whether another primer of the same controller, as collectors add one, stands before."""
+        chain = chain_of(self)
+        before = chain[: next(index for index, member in enumerate(chain) if member is self)]
+        return any(isinstance(x, L1Primer) and x._shared is self._shared for x in before)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         nested = next_tensordict.get(self.key, None)
@@ -328,7 +344,7 @@ class L1Controller(TensorDictModuleBase):
         )
         self.observation_key = observation_key
         self.action_key = action_key
-        self.key = key
+        self.key = entry_name(key, "L1Controller")
         self.compile_mode = compile
         self.diagnostics = diagnostics
         self.check_dt, self.check = check_dt, check
@@ -391,6 +407,13 @@ class L1Controller(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """One step of the controller, see the class."""
+        environment, is_eager = self._environment, not torch.compiler.is_compiling()
+        action = tensordict.get(self.action_key, None)
+        if is_eager and action is not None and action is environment.sent:
+            raise ValueError(
+                f"L1Controller is applied again to {self.action_key!r}, its own output: the policy "
+                "holds it twice, or wrote no action before it"
+            )
         ahead = advance(
             self._prepared(),
             self._state_names,
@@ -405,6 +428,8 @@ class L1Controller(TensorDictModuleBase):
             emitted=self._environment.emitted,
             seal_is_required=False,
         )
+        if is_eager:
+            environment.sent = ahead.executed
         tensordict.set((self.key, "u_rl"), ahead.u_rl)
         tensordict.set(self.action_key, ahead.executed)
         tensordict.set(("next", self.key), ahead.following)

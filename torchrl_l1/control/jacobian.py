@@ -17,6 +17,7 @@ from torchrl_l1.control.probe import (
     ChangeFunction,
     Mode,
     describe,
+    failure,
     probe,
     refuse_training,
 )
@@ -96,6 +97,10 @@ class ActionJacobian:
     ) -> None:
         if predicts not in (None, "change", "next_observation"):
             raise ValueError(f"predicts must be 'change' or 'next_observation', got {predicts!r}")
+        if isinstance(dynamics, type):
+            raise TypeError(
+                f"dynamics is the class {dynamics.__name__}: give a model, {dynamics.__name__}(...)"
+            )
         self.dynamics = dynamics
         self.ensemble_dim = ensemble_dim
         self.analytic = callable(getattr(dynamics, "value_and_jacobian", None))
@@ -192,7 +197,7 @@ class ActionJacobian:
             else:
                 self._lift(observation, action)
                 modes = {"forward": self._forward_mode, "reverse": self._reverse_mode}
-                mode = probe(self.dynamics, self.value, modes, observation, action)
+                mode = probe(self.dynamics, self._first_value, modes, observation, action)
             self._mode, self._training = mode, training
 
     def _lift(self, observation: Tensor, action: Tensor) -> None:
@@ -202,11 +207,11 @@ class ActionJacobian:
         refuse_training(self.dynamics)
         with torch.no_grad(), torch.random.fork_rng([]):
             try:
-                self.value(observation, action)
+                self._first_value(observation, action)
             except (RuntimeError, ValueError, IndexError):
                 self._lifted = True
                 try:
-                    self.value(observation, action)
+                    self._first_value(observation, action)
                 except Exception:
                     self._lifted = False
 
@@ -214,7 +219,19 @@ class ActionJacobian:
         """Predicted change of state: ``(..., n)`` and ``(..., m)`` to ``(..., n)``."""
         if self._lifted and observation.ndim == 1:
             return self.value(observation.unsqueeze(0), action.unsqueeze(0)).squeeze(0)
-        prediction = self._predict(observation, action)
+        return self._change(self._predict(observation, action), observation, action)
+
+    def _first_value(self, observation: Tensor, action: Tensor) -> Tensor:
+        """:meth:`value`, with a word on the model where it cannot be called."""
+        if self._lifted and observation.ndim == 1:
+            return self._first_value(observation.unsqueeze(0), action.unsqueeze(0)).squeeze(0)
+        try:
+            prediction = self._predict(observation, action)
+        except Exception as error:  # of a model that is made for something else, anything
+            raise failure(self.dynamics, observation, action, error) from error
+        return self._change(prediction, observation, action)
+
+    def _change(self, prediction: Tensor, observation: Tensor, action: Tensor) -> Tensor:
         self._check_type(prediction, observation)
         if self.ensemble_dim is not None:
             prediction = prediction.mean(self.ensemble_dim)

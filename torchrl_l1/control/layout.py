@@ -23,6 +23,18 @@ from torchrl_l1.control.state import L1Diagnostics, L1State, init
 L1_KEY = "l1"
 """Default key of the nested tensordict that holds the controller's state and signals."""
 
+
+def entry_name(key: str, owner: str) -> str:
+    """The name of the nested tensordict, if it is one.
+
+    Raises:
+        TypeError: if it is a key of several parts.
+    """
+    if not isinstance(key, str):
+        raise TypeError(f"{owner} keeps its entries under one name: key must be a str, got {key!r}")
+    return key
+
+
 _FLAGS = ("switch", "ill_conditioned", "non_finite")
 
 

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import (
     ActionScaling,
     Compose,
@@ -18,10 +18,9 @@ from torchrl.envs.transforms import (
     Transform,
 )
 
-from torchrl_l1.control.layout import L1_KEY, required_entry
-
-# Where the executed input waits, inside the tensordict, for the base environment to return.
-_PENDING = "_oracle_pending"
+from torchrl_l1.control.controller import L1Primer
+from torchrl_l1.control.layout import L1_KEY, entry_name, required_entry
+from torchrl_l1.control.transform import L1Transform
 
 
 class OracleTransform(Transform):
@@ -55,7 +54,8 @@ class OracleTransform(Transform):
 
     Raises:
         ValueError: at a reset, if a transform that maps actions to other units stands between a
-            disturbance and the oracle.
+            disturbance and the oracle, if there is another controller, or if disturbances are
+            within the members of a batched environment, each in its own.
         KeyError: at a step, if there is no action.
         RuntimeError: if used in a replay buffer.
 
@@ -73,7 +73,9 @@ class OracleTransform(Transform):
     def __init__(self, action_key: NestedKey = "action", key: str = L1_KEY) -> None:
         super().__init__()
         self.action_key = unravel_key(action_key)
-        self.key = key
+        self.key = entry_name(key, "OracleTransform")
+        # Where the executed input waits, inside the tensordict, for the base environment to return.
+        self._pending = f"_{key}_oracle_pending"
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the executed input."""
@@ -101,10 +103,10 @@ class OracleTransform(Transform):
                 executed = executed.clamp(bounds.space.low, bounds.space.high)
         # The caller's tensordict keeps the policy's action: this one is a shallow copy.
         tensordict.set(self.action_key, executed)
-        return tensordict.set(_PENDING, executed)
+        return tensordict.set(self._pending, executed)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        executed = tensordict.get(_PENDING)
+        executed = tensordict.get(self._pending)
         stepped = tensordict.get("_step", None)
         if stepped is not None:
             before = tensordict.get((self.key, "u_exec"))
@@ -116,17 +118,16 @@ class OracleTransform(Transform):
     ) -> TensorDictBase:
         # Partial resets are merged by the environment, which discards the rows not reset.
         list(self._compensations())
+        self._check_surroundings()
         action = self._action_spec()
         extra = tensordict_reset.batch_size[: tensordict_reset.ndim - action.ndim + 1]
         nothing = torch.zeros(*extra, *action.shape, dtype=action.dtype, device=action.device)
         return tensordict_reset.set((self.key, "u_exec"), nothing)
 
     def _action_spec(self) -> TensorSpec:
-        # That of the actuators, whatever transforms make of it on the way to the policy.
-        environment = self._environment()
-        while isinstance(environment, TransformedEnv):
-            environment = environment.base_env
-        return environment.full_action_spec[self.action_key]
+        # In the units of what is sent from here, whatever later transforms make of them.
+        self._environment()
+        return self.parent.full_action_spec[self.action_key]
 
     def _environment(self) -> EnvBase:
         try:
@@ -150,16 +151,12 @@ class OracleTransform(Transform):
         An action meets the last transform first and the plant last: what the plant is to receive
         is traced back from the first transform, of the innermost environment.
         """
-        chains, environment = [], self._environment()
-        while isinstance(environment, TransformedEnv):
-            chains.append(environment.transform)
-            environment = environment.base_env
         undone = ""
-        for transform in (member for chain in reversed(chains) for member in chain.modules()):
+        for transform in _transforms(self._environment()):
             if transform is self:
                 return
             compensate = getattr(transform, "compensate", None)
-            if compensate is not None:
+            if compensate is not None and self._is_of_this_action(transform, "key"):
                 undone = type(transform).__name__
                 yield compensate
             elif undone and self._changes_units(transform):
@@ -169,6 +166,32 @@ class OracleTransform(Transform):
                     f"in the units of the other: put {name} after OracleTransform"
                 )
 
+    def _check_surroundings(self) -> None:
+        environment = self._environment()
+        for transform in _transforms(environment):
+            is_controller = isinstance(transform, (L1Primer, L1Transform, OracleTransform))
+            is_other = is_controller and transform is not self
+            if is_other and self._is_of_this_action(transform, "action_key"):
+                raise ValueError(
+                    f"{type(transform).__name__} is there beside OracleTransform, and both would "
+                    "act against one disturbance: leave one of them out"
+                )
+        while isinstance(environment, TransformedEnv):
+            environment = environment.base_env
+        members = environment.__dict__.get("_envs", []) if type(environment) is SerialEnv else []
+        for transform in (inner for member in members for inner in _transforms(member)):
+            disturbs = callable(getattr(transform, "compensate", None))
+            if disturbs and self._is_of_this_action(transform, "key"):
+                name = type(transform).__name__
+                raise ValueError(
+                    f"{name} is within the members of a SerialEnv, where OracleTransform does not "
+                    f"reach it: write TransformedEnv(SerialEnv(...), Compose({name}(...), "
+                    "OracleTransform()))"
+                )
+
+    def _is_of_this_action(self, transform: nn.Module, name: str) -> bool:
+        return unravel_key(getattr(transform, name, self.action_key)) == self.action_key
+
     def _changes_units(self, transform: object) -> bool:
         if isinstance(transform, (Compose, DTypeCastTransform, DeviceCastTransform)):
             return False
@@ -177,3 +200,12 @@ class OracleTransform(Transform):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(key={self.key!r})"
+
+
+def _transforms(environment: EnvBase) -> list[nn.Module]:
+    """All transforms of an environment, those of environments inside first."""
+    chains = []
+    while isinstance(environment, TransformedEnv):
+        chains.append(environment.transform)
+        environment = environment.base_env
+    return [member for chain in reversed(chains) for member in chain.modules()]

@@ -248,7 +248,7 @@ class Settings:
         others: further fields of :class:`L1Config`'s.
 
     Raises:
-        TypeError: for fields that it lacks.
+        TypeError: for fields that it lacks, or a config of another type.
         ValueError: if both config and fields are given, or a setting does not fit.
     """
 
@@ -256,6 +256,11 @@ class Settings:
         self, owner: str, config: L1Config | None, dt: float | None, others: dict[str, Any]
     ) -> None:
         self.owner = owner
+        if config is not None and not isinstance(config, L1Config):
+            raise TypeError(
+                f"{owner} takes an L1Config as its second argument, got {config!r}: give settings "
+                "by name, as dt=0.05, or as L1Config(...)"
+            )
         if config is not None:
             given = [name for name, value in {"dt": dt, **others}.items() if value is not None]
             if given:

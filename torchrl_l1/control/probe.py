@@ -87,7 +87,9 @@ def probe(
     _warn_of_units(dynamics, observation)
     devices = [observation.device] if observation.device.type == "cuda" else []
     with torch.no_grad(), torch.random.fork_rng(devices):
-        value = change(observation, action)
+        given = observation.clone(), action.clone()
+        value = change(*given)
+        _check_unwritten(dynamics, given, (observation, action))
         _check_repeatable(dynamics, change, observation, action, value)
         _check_rows(dynamics, change, observation, action, value)
         return _choose_mode(dynamics, change, jacobians, observation, action, value)
@@ -183,7 +185,8 @@ def refuse_training(dynamics: object) -> None:
     """
     for root in _modules(dynamics):
         for name, layer in root.named_modules():
-            if layer.training and _needs_eval(layer):
+            # What torch.jit.freeze made has no mode any more.
+            if getattr(layer, "training", False) and _needs_eval(layer):
                 raise ValueError(
                     f"{describe(dynamics)} is in train mode, in which its layer "
                     f"{_label(name, layer)} gives L1 another prediction at each call or mixes the "
@@ -229,6 +232,20 @@ def _differ(a: Tensor, b: Tensor, observation: Tensor) -> bool:
     """Whether two predictions of a change, from this observation, differ by more than rounding."""
     size = max(float(x.abs().max()) if x.numel() else 0.0 for x in (a, observation))
     return not bool(((a - b).abs() <= 16 * torch.finfo(a.dtype).eps * size).all())
+
+
+def _check_unwritten(
+    dynamics: object, given: tuple[Tensor, Tensor], before: tuple[Tensor, Tensor]
+) -> None:
+    """Refuse a model that works on its inputs in place: they are the environment's tensors."""
+    for name, one, other in zip(("observation", "action"), given, before, strict=True):
+        # What is written may be what was there; tensors of inference mode do not count writes.
+        written = not one.is_inference() and one._version > 0
+        if written or not torch.equal(one, other):
+            raise ValueError(
+                f"{describe(dynamics)} writes to its {name} in place, which belongs to the "
+                "environment: let it work on a copy"
+            )
 
 
 def _check_repeatable(
@@ -328,6 +345,15 @@ def _warn_of_reverse(
         f"{describe(dynamics)} is differentiated in reverse mode{cause}: a Jacobian takes {n} "
         f"backward passes in place of {m} forward ones, and a step one Jacobian or two",
         stacklevel=2,
+    )
+
+
+def failure(dynamics: object, observation: Tensor, action: Tensor, error: Exception) -> ValueError:
+    """What to raise where a model cannot be called at all."""
+    return ValueError(
+        f"{describe(dynamics)} failed at its first call, with two arguments, an observation of "
+        f"shape {tuple(observation.shape)} and an action of shape {tuple(action.shape)}, both "
+        f"{observation.dtype}, which L1 expects a model to take: {_first_line(error)}"
     )
 
 

@@ -120,6 +120,11 @@ def verify(
     if emitted is not None and emitted.is_what_is_read(observation, state, seal):
         return observation
     found = sealed(observation, state)
+    if found.shape != seal.shape:
+        raise ValueError(
+            f"{owner}: the state under {key!r} is that of an L1 with other settings or widths, of "
+            "another controller's primer: each needs its own, under a key of its own"
+        )
     if not torch.equal(found, seal):
         n = observation.shape[-1]
         _compare(found, seal, n, owner, repr(observation_key), key, state, emitted, zero_is_none)

@@ -24,6 +24,7 @@ from torchrl_l1.control.layout import (
     Layout,
     advance,
     as_action_jacobian,
+    entry_name,
 )
 from torchrl_l1.control.pipeline import (
     Settings,
@@ -154,13 +155,13 @@ class L1Transform(Transform):
         )
         self.observation_key = unravel_key(observation_key)
         self.action_key = unravel_key(action_key)
-        self.key = key
+        self.key = entry_name(key, "L1Transform")
         self._pending = f"_{key}_pending"
         self._state_names = state_names(self._settings.config)
         self.check_dt, self.check = check_dt, check
         self.compile_mode = compile
         self.diagnostics = diagnostics
-        self.dtype = self.model.dtype if dtype is None else dtype
+        self.dtype = dtype
         self._layout: Layout | None = None
         self._zero: tuple[Layout, L1Config, TensorDictBase] | None = None
         self._is_ready = self._is_stateful = False
@@ -292,6 +293,7 @@ class L1Transform(Transform):
     ) -> TensorDictBase:
         # Partial resets are merged by the environment, which discards the rows not reset.
         self._complete()
+        self._check_dtype()
         self._last.repeats = 0
         observation = tensordict_reset.get(self.observation_key)
         self._check_finite(observation, tensordict.get("_reset", None))
@@ -349,7 +351,8 @@ class L1Transform(Transform):
             parent = self.parent
             if parent is None:
                 raise RuntimeError("L1Transform belongs to no environment yet")
-            layout = Layout.of(parent, self.observation_key, self.action_key, self.dtype)
+            dtype = self.model.dtype if self.dtype is None else self.dtype
+            layout = Layout.of(parent, self.observation_key, self.action_key, dtype)
             dimensions = layout.observation_dim, layout.action_dim
             layout.bounded(self._settings.config).check_dimensions(*dimensions)
             self.model.check_dimensions(*dimensions)
@@ -374,6 +377,15 @@ class L1Transform(Transform):
             self._step_function = make_step(config, self.model, self.compile_mode, self.diagnostics)
             self._step_config = config
         self._is_ready = True
+
+    def _check_dtype(self) -> None:
+        """Refuse a model of another type than that of which the specs are."""
+        now, layout = self.model.dtype, self._resolve()
+        if self.dtype is None and now not in (None, layout.dtype):
+            raise ValueError(
+                f"the model is of {now} and was of {layout.dtype} when L1Transform came into the "
+                "environment: convert it before, or make the environment anew"
+            )
 
     def _check_order(self) -> None:
         names = (*self._state_names, SEAL)

@@ -17,7 +17,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_l1.algorithms.collection import ORACLE, seed_streams, stream_seed
 from torchrl_l1.control import L1Config, L1Transform, OracleTransform
-from torchrl_l1.deployment.learning import policy_transforms
+from torchrl_l1.deployment.learning import Acting, policy_transforms
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.envs import DISTURBANCES, SUITES, EnvironmentSource, suite
 from torchrl_l1.experiment.l1_options import OFF, UNTUNED
@@ -49,6 +49,11 @@ def disturbance_cells(disturbances: Disturbances) -> list[dict[str, float]]:
     """
     if isinstance(disturbances, str):
         return suite(disturbances)
+    if not isinstance(disturbances, Mapping):
+        raise ValueError(
+            "disturbances are values by name, such as {'bias': [0.5, 1.0]}, or a suite, 'quick', "
+            f"got {disturbances!r}"
+        )
     cells: list[dict[str, float]] = [{}]
     for name, values in disturbances.items():
         if name not in DISTURBANCES:
@@ -90,16 +95,20 @@ def run_episodes(
     """Deterministic episodes ``[N, T]``; rows of those that end early repeat their last step.
 
     With one seed, episodes of one number start from the same reset whatever the disturbance and
-    the control.
+    the control. Where there is neither, a warning tells of actions beyond the bounds.
     """
     extra = [*policy_transforms(policy, source.one), *control]
     env = source.several(episodes, disturbances, extra)
     env.set_seed(stream_seed(seed, "evaluate") % 2**31)
     seed_streams(seed, "evaluate")
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        data = env.rollout(most_steps, policy, break_when_any_done=False, break_when_all_done=True)
+        acting = Acting(policy, env.full_action_spec["action"])
+        data = env.rollout(most_steps, acting, break_when_any_done=False, break_when_all_done=True)
+    if not disturbances and not control:
+        acting.warn_of_bounds()
+    rows = env.batch_size.numel()
     env.close()
-    return data
+    return data if data.ndim == 2 else data.reshape(rows, -1)
 
 
 def summarize_episodes(data: TensorDictBase) -> Episodes:

@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Bounded, ReplayBuffer, TensorSpec
-from torchrl.envs import Compose, EnvBase, InitTracker, TensorDictPrimer, Transform
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    InitTracker,
+    TensorDictPrimer,
+    Transform,
+    TransformedEnv,
+)
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.utils import get_primers_from_module
 
 from torchrl_l1.algorithms.collection import seed_streams, stream_seed
+from torchrl_l1.control import L1Primer, L1Transform, OracleTransform
 from torchrl_l1.dynamics import EnsembleDynamics, read_transitions
 from torchrl_l1.envs import EnvironmentSource
 
@@ -25,6 +33,72 @@ FEW_OBSERVATIONS = 5
 _MEAN_HOLD = 10
 
 _ROWS = 10  # recorded steps are laid side by side in so many
+
+
+_ROUNDING = 1e-5  # of a bound
+
+
+class Acting(TensorDictModuleBase):
+    """A policy whose actions are looked at on the way: their shape, and how many leave the bounds.
+
+    Args:
+        policy: the policy.
+        action: spec of the action, for all environments.
+
+    Attributes:
+        steps: steps of single environments so far.
+        beyond: those with an action beyond the bounds.
+
+    Raises:
+        ValueError: if the policy fails at its first call, or returns another shape.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase, action: TensorSpec) -> None:
+        super().__init__()
+        self.policy = policy
+        self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
+        self.shape = action.shape
+        self.bounds = None
+        if isinstance(action, Bounded):
+            low, high = action.space.low, action.space.high
+            self.bounds = low - _ROUNDING * low.abs(), high + _ROUNDING * high.abs()
+        self.steps = self.beyond = 0
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Act."""
+        count = tensordict.batch_size.numel()
+        try:
+            tensordict = self.policy(tensordict)
+        except Exception as error:
+            if self.steps:
+                raise
+            # Of a policy that is made for something else, anything.
+            raise ValueError(
+                f"the policy failed at its first call, with observations of shape "
+                f"{list(tensordict['observation'].shape)} and {tensordict['observation'].dtype}: "
+                f"{' '.join(str(error).split())[:200] or type(error).__name__}"
+            ) from error
+        action = tensordict.get("action")
+        if action.shape != self.shape:
+            raise ValueError(
+                f"the policy returned an action of shape {list(action.shape)} for {count} "
+                f"environments side by side, expected {list(self.shape)}: one vector for each"
+            )
+        self.steps += count
+        if self.bounds is not None:
+            low, high = self.bounds
+            self.beyond += int(((action < low) | (action > high)).any(-1).sum())
+        return tensordict
+
+    def warn_of_bounds(self) -> None:
+        """Say so where actions lay beyond the bounds."""
+        if self.beyond:
+            warnings.warn(
+                f"{self.beyond} of {self.steps} actions of the policy lie beyond the environment's "
+                "bounds: L1 and the oracle stay within them, and without L1 nothing clips, so that "
+                "their rows differ by that too; clip the action in the policy",
+                stacklevel=2,
+            )
 
 
 class Exploration(TensorDictModuleBase):
@@ -45,7 +119,7 @@ class Exploration(TensorDictModuleBase):
 
     def __init__(self, policy: TensorDictModuleBase, action: TensorSpec, noise: float) -> None:
         super().__init__()
-        self.policy = policy
+        self.policy = Acting(policy, action)
         self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
         bounds = action.space if isinstance(action, Bounded) else None
         self.low = None if bounds is None else bounds.low
@@ -133,24 +207,90 @@ def collect(
             -(-steps // rows), exploring, callback=progress, break_when_any_done=False
         )
     env.close()
-    return data
+    return data if data.ndim == 2 else data.reshape(rows, -1)
+
+
+def check_surroundings(env: EnvBase) -> None:
+    """Refuse an environment with a controller of its own.
+
+    Raises:
+        ValueError: naming it.
+    """
+    for transform in _transforms(env):
+        if isinstance(transform, (L1Primer, L1Transform, OracleTransform)):
+            raise ValueError(
+                f"the environment brings {type(transform).__name__} along, beside which another "
+                "controller would act: give the environment without it"
+            )
+
+
+def warn_of_disturbances(env: EnvBase) -> None:
+    """Data are to be of the undisturbed plant: a bias in them is nominal to the model."""
+    for transform in _transforms(env):
+        if callable(getattr(transform, "compensate", None)):
+            warnings.warn(
+                f"the environment brings {type(transform).__name__} along: the model takes "
+                "it for the plant's, and L1 will not cancel it; give robustify the undisturbed "
+                "environment, and evaluate the disturbances",
+                stacklevel=3,
+            )
+
+
+def _transforms(env: EnvBase) -> Iterator[torch.nn.Module]:
+    while isinstance(env, TransformedEnv):
+        yield from env.transform.modules()
+        env = env.base_env
+
+
+def agreed_time_step(source: EnvironmentSource, dt: float | None) -> float:
+    """Time of a step in seconds, as given or else as the environment tells.
+
+    Raises:
+        ValueError: if it is not known, or the environment tells another.
+    """
+    name, told = source.name or "the environment", source.time_step()
+    if dt is None:
+        if told is None:
+            raise ValueError(
+                f"{name} does not tell the time of its steps: give dt (--dt), in seconds"
+            )
+        return told
+    if told is not None and abs(dt - told) > 1e-4 * told:
+        raise ValueError(
+            f"dt={dt:.6g} was given, but a step of {name} takes {told:.6g} s: leave dt out"
+        )
+    return dt
 
 
 def recorded(
-    data: TensorDictBase | ReplayBuffer | Sequence[TensorDictBase], env: EnvBase
+    data: TensorDictBase | ReplayBuffer | Sequence[TensorDictBase], env: EnvBase, dt: float
 ) -> TensorDictBase:
     """Recorded steps in the form of :func:`collect`'s, what is no transition left out.
 
     Args:
         data: undisturbed transitions, see :func:`~torchrl_l1.dynamics.read_transitions`.
         env: the environment that they are of.
+        dt: time of its steps in seconds; that of the data, where these hold one, may differ by
+            2 %, as clocks do.
 
     Returns:
         ``[rows, T]``, float32.
 
     Raises:
-        ValueError: if widths are not the environment's, or there are too few of them.
+        ValueError: if widths or the time of a step are not the environment's, or there are too few
+            transitions.
     """
+    held = data
+    if isinstance(data, ReplayBuffer):
+        held = data[:] if len(data) else []
+    for part in [held] if isinstance(held, TensorDictBase) else held:
+        step = part.get("dt", None) if isinstance(part, TensorDictBase) else None
+        taken = dt if step is None else float(step.double().median())
+        if abs(taken - dt) > 0.02 * dt:
+            raise ValueError(
+                f"the data were recorded with steps of {taken:.4g} s, and the environment takes "
+                f"{dt:.4g} s: resample them, or let its steps be as long"
+            )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the fit, which reads them too, says what it drops
         found = read_transitions(data, dtype=torch.float32)

@@ -23,6 +23,7 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, TensorDictPrimer
 from torchrl.modules.utils import get_primers_from_module
 
+from torchrl_l1.control import L1Controller
 from torchrl_l1.envs import load_attribute
 from torchrl_l1.envs.references import require
 from torchrl_l1.experiment.checkpoints import kept_by
@@ -285,6 +286,8 @@ def load_policy(
             found.load_state_dict(stored)
         except (RuntimeError, TypeError, AttributeError) as error:
             raise ValueError(f"{weights} does not fit the policy: {_short(error)}") from error
+    if isinstance(found, nn.Module):
+        _check_mode(found)
     if isinstance(found, TensorDictModuleBase):
         _check_keys(found, env)
         return found
@@ -296,8 +299,25 @@ def load_policy(
     return FunctionPolicy(found, env.full_observation_spec["observation"], action)
 
 
+def _check_mode(policy: nn.Module) -> None:
+    """Refuse a policy in train mode that normalises by the batch, and tell of one that draws."""
+    for name, layer in policy.named_modules():
+        if not getattr(layer, "training", False):
+            continue
+        words = f"the policy is in train mode, in which its layer {name} ({type(layer).__name__})"
+        if isinstance(layer, nn.modules.batchnorm._BatchNorm):
+            raise ValueError(
+                f"{words} mixes the environments of a batch and learns from them: call its eval()"
+            )
+        drops = isinstance(layer, nn.modules.dropout._DropoutNd) and layer.p > 0
+        if drops and isinstance(policy, TensorDictModuleBase):
+            warnings.warn(f"{words} draws at random: call its eval()", stacklevel=3)
+
+
 def _check_keys(policy: TensorDictModuleBase, env: EnvBase) -> None:
     """Refuse a module that reads what the environment has not, or writes no action."""
+    if any(isinstance(module, L1Controller) for module in policy.modules()):
+        raise ValueError("the policy has an L1Controller of its own: give the actor without it")
     if "action" not in unravel_key_list(policy.out_keys):
         raise ValueError(
             f"the policy writes {list(policy.out_keys)} and no 'action': wrap it in a module that "

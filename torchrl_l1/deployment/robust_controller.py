@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -23,11 +22,14 @@ from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.control.layout import Layout
 from torchrl_l1.deployment.assessment import Assessment, Disturbances, assess
 from torchrl_l1.deployment.learning import (
+    agreed_time_step,
+    check_surroundings,
     collect,
     epsilon_for,
     policy_transforms,
     recorded,
     target_switch_rate,
+    warn_of_disturbances,
 )
 from torchrl_l1.deployment.policies import Policy, load_policy
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, calibrate_filter, fit_dynamics
@@ -90,13 +92,19 @@ class RobustController:
             with an ``L1Transform`` as its last transform: ``env.rollout(1000, robust.policy)``.
         """
         config = self.settings(preset)
-        env = TransformedEnv(vector_environment(env), auto_unwrap=True)
+        env = TransformedEnv(self._joined(env), auto_unwrap=True)
         for transform in [
             *policy_transforms(self.policy, lambda: env),
             L1Transform(self.model, config),
         ]:
             env.append_transform(transform)
         return env
+
+    def _joined(self, env: EnvBase) -> EnvBase:
+        """With the parts of the observation in the policy's order, if they are not joined yet."""
+        there = getattr(env, "full_observation_spec", {}).get("observation", None)
+        is_whole = there is not None and there.shape[-1] == self.model.observation_dim
+        return vector_environment(env, () if is_whole else self.source.observation_keys)
 
     def settings(self, preset: str | None) -> L1Config:
         """The settings of a preset; those that act by default if ``None``.
@@ -334,7 +342,8 @@ def robustify(
 
     Raises:
         ValueError: for a setting out of its domain, an environment that does not tell its time
-            step, or observations and actions that are no vectors.
+            step, tells another or has a controller already, observations and actions that are no
+            vectors, or a policy whose actions do not fit.
 
     Examples:
         >>> from torchrl_l1.dynamics import FitConfig
@@ -353,23 +362,19 @@ def robustify(
         check_positive("dt", dt)
     with _private_randomness():  # environments may draw a seed as they are made
         source = _source(make_env, policy)
-        dt = source.time_step() if dt is None else dt
-    if dt is None:
-        raise ValueError(
-            f"{source.name or 'the environment'} does not tell the time of its steps: give dt "
-            "(--dt), in seconds"
-        )
+        dt = agreed_time_step(source, dt)
     with _private_randomness():
         env = source.one()
+        check_surroundings(env)
         acting = load_policy(policy, env, normalization, weights)
         if data is None:
             with _bar("collect", "step", progress) as bar:
                 bar.total = steps
                 found = collect(source, acting, steps, environments, noise, seed, bar.update)
-            _warn_of_disturbances(env)
+            warn_of_disturbances(env)
             data = found
         else:
-            found = recorded(data, env)
+            found = recorded(data, env, dt)
         with _bar("fit", "epoch", progress) as bar:
             dynamics = fit_dynamics(
                 data, config=fit or FIT, seed=seed, on_epoch=lambda _: bar.update(),
@@ -402,20 +407,6 @@ def robustify(
         source, acting, dynamics, {name: configs[name] for name in reversed(order)},
         preset, origin,
     )  # fmt: skip
-
-
-def _warn_of_disturbances(env: EnvBase) -> None:
-    """Data are to be of the undisturbed plant: a bias in them is nominal to the model."""
-    while isinstance(env, TransformedEnv):
-        for transform in env.transform.modules():
-            if callable(getattr(transform, "compensate", None)):
-                warnings.warn(
-                    f"the environment brings {type(transform).__name__} along: the model takes "
-                    "it for the plant's, and L1 will not cancel it; give robustify the undisturbed "
-                    "environment, and evaluate the disturbances",
-                    stacklevel=3,
-                )
-        env = env.base_env
 
 
 def load_target(

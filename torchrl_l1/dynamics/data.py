@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 _Path = str | os.PathLike[str]
 
+# What flags of an episode's end are called, by D4RL, Minari, Gymnasium and TorchRL among others.
+_ENDS = ("done", "terminal", "terminated", "termination", "timeout", "truncated", "truncation")
+
 # Steps of time that differ by more from the usual one are gaps.
 _JITTER = 0.1
 
@@ -57,7 +60,9 @@ def read_csv(
     Raises:
         FileNotFoundError: if there is no such file.
         KeyError: if there is no such column.
-        ValueError: for a cell that is no number, or if no two lines follow each other.
+        ValueError: for a cell that is no number, a line with more cells than there are columns, if
+            no two lines follow each other, or if neither episode nor time is given and a column
+            such as ``done`` tells of several episodes.
 
     Examples:
         >>> from pathlib import Path
@@ -80,11 +85,14 @@ def read_csv(
     numbers = [*observation, *action, *([] if time is None else [time])]
     wanted = [*numbers, *([] if episode is None else [episode])]
     try:
-        columns = _columns(path, wanted, numbers, delimiter)
+        columns = _columns(path, wanted, numbers, delimiter, flags=episode is None and time is None)
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is no text in UTF-8 ({error.reason}): save it as such") from None
     except csv.Error as error:
         raise ValueError(f"{path} is no table of text: {error}") from None
+    for name in columns.keys() - set(wanted):
+        ends = [cell.lower() not in ("", "0", "0.0", "false", "no") for cell in columns[name]]
+        _check_ends(str(path), name, np.array(ends, dtype=bool))
     x, u = (
         torch.tensor([columns[name] for name in names], dtype=torch.float64).T
         for names in (observation, action)
@@ -117,7 +125,8 @@ def read_npz(
     Raises:
         FileNotFoundError: if there is no such file.
         KeyError: if there is no such array.
-        ValueError: if arrays are not numbers of one length, or the file is none of NumPy's.
+        ValueError: if arrays are not numbers of one length, if the file is none of NumPy's, or for
+            several episodes as there.
     """
     try:
         file = np.load(path, allow_pickle=False)
@@ -151,6 +160,9 @@ def read_npz(
             raise ValueError(f"{path}: {names} have lengths {sorted(lengths)}, expected one length")
         return torch.cat(parts, -1)
 
+    for key, flags in arrays.items() if episode is None and time is None else ():
+        if _is_end(key) and flags.dtype.kind in "fiub":
+            _check_ends(str(path), key, flags.reshape(-1) != 0)
     x, u = side_by_side(observation), side_by_side(action)
     if len(x) == len(u) + 1:
         u = torch.cat([u, u.new_zeros(1, u.shape[-1])])
@@ -215,15 +227,21 @@ def read_minari(dataset: str | MinariDataset, download: bool = False) -> TensorD
 
 
 def _columns(
-    path: _Path, wanted: Sequence[str], numbers: Sequence[str], delimiter: str
+    path: _Path, wanted: Sequence[str], numbers: Sequence[str], delimiter: str, flags: bool
 ) -> dict[str, list[Any]]:
-    """Columns of a table by name; those of ``numbers`` as numbers, empty cells as NaN."""
+    """Columns of a table by name; those of ``numbers`` as numbers, empty cells as NaN.
+
+    With ``flags`` those too that tell the ends of episodes.
+    """
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file")
+    if len(delimiter) != 1:
+        raise ValueError(f"{path}: the delimiter is one character, like '\\t', got {delimiter!r}")
     # A byte order mark is none of the first column's name.
     with open(path, newline="", encoding="utf-8-sig") as file:
-        lines = csv.reader(file, delimiter=delimiter)
-        header = [name.strip() for name in next(lines, [])]
+        # Spaces after a delimiter keep quotes from being seen, and are themselves delimiters.
+        lines = csv.reader(file, delimiter=delimiter, skipinitialspace=True)
+        header = [name.strip() for name in next(filter(None, lines), [])]
         if header:
             header[0] = header[0].removeprefix("#").strip()
         for name in wanted:
@@ -233,11 +251,17 @@ def _columns(
                 raise KeyError(f"{path} has no column {name!r}, only {there}{hint}")
             if header.count(name) > 1:
                 raise ValueError(f"{path} has {header.count(name)} columns {name!r}: rename them")
-        places = {name: header.index(name) for name in wanted}
-        columns: dict[str, list[Any]] = {name: [] for name in wanted}
+        extra = [name for name in header if flags and _is_end(name) and name not in wanted]
+        places = {name: header.index(name) for name in [*wanted, *extra]}
+        columns: dict[str, list[Any]] = {name: [] for name in places}
         for line in lines:
             if not any(cell.strip() for cell in line):
                 continue
+            if any(cell.strip() for cell in line[len(header) :]):
+                raise ValueError(
+                    f"{path}, line {lines.line_num} has {len(line)} cells for {len(header)} "
+                    f"columns: there is a column without a name, or a {delimiter!r} within numbers"
+                )
             for name, place in places.items():
                 cell = line[place].strip() if place < len(line) else ""
                 if name in numbers:
@@ -250,6 +274,21 @@ def _columns(
                 else:
                     columns[name].append(cell)
     return columns
+
+
+def _is_end(name: str) -> bool:
+    return name.lower().removeprefix("is_").rstrip("s") in _ENDS
+
+
+def _check_ends(path: str, name: str, ends: np.ndarray) -> None:
+    """Refuse a file that tells of several episodes where it is to be read as one."""
+    count = int(ends[:-1].sum())
+    if count:
+        raise ValueError(
+            f"{path} tells by {name!r} of {count} episodes that end before the last row, and would "
+            "be read as one: name what numbers them as episode, such as the running count of their "
+            "starts, or the time"
+        )
 
 
 def _rows(

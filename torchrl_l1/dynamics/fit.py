@@ -320,7 +320,7 @@ def fit_dynamics(
     entry_names(n, names, units)
     transitions.warn_of_gaps(*keys)
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.manual_seed(int(seed))
         dynamics = make_dynamics(n, m, **{"hidden": (128, 128), **settings}).to(here)
         optimizer = torch.optim.Adam(dynamics.parameters(), lr=config.learning_rate)
         fit_to_transitions(dynamics, transitions, config, optimizer, on_epoch)

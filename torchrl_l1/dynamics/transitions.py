@@ -21,6 +21,7 @@ _PIECE = 100
 _TRAJECTORY_IDS: tuple[NestedKey, ...] = (("collector", "traj_ids"), "traj_ids")
 _PADDING: tuple[NestedKey, ...] = (("collector", "mask"), "mask")
 _ENDS = ("done", "terminated", "truncated")
+_STEPS: tuple[NestedKey, ...] = ("steps_to_next_obs", ("next", "steps_to_next_obs"))
 
 
 @dataclass
@@ -227,6 +228,7 @@ def _read(
             device=device, dtype=dtype or torch.get_default_dtype()
         )
 
+    _check_single_steps(data, next_key)
     observation = vectors(observation_key, "observation_key")
     following = vectors(next_key, "observation_key")
     action = vectors(action_key, "action_key")
@@ -298,11 +300,23 @@ def _entry(data: TensorDictBase, key: NestedKey, option: str) -> Tensor:
         there = ", ".join(sorted(_name(one) for one in data.keys(True, True)))
         raise KeyError(
             f"the data have no {_name(key)}, only {there}: name it by {option}, or rename it"
+            + "; it is what followed each step, the observation one row later" * (key[0] == "next")
         )
     if not isinstance(value, Tensor) or value.is_complex():
         kind = value.dtype if isinstance(value, Tensor) else type(value).__name__
         raise ValueError(f"{_name(key)} is {kind}, expected a tensor of real numbers")
     return value
+
+
+def _check_single_steps(data: TensorDictBase, next_key: NestedKey) -> None:
+    """Refuse what MultiStep of TorchRL left, where what followed is several steps away."""
+    for key in _STEPS:
+        if (steps := data.get(key, None)) is not None and bool((steps > 1).any()):
+            raise ValueError(
+                f"{_name(next_key)} is up to {int(steps.max())} steps later, as {_name(key)} says, "
+                "which MultiStep wrote: a model predicts one step, give data that it has not "
+                "changed"
+            )
 
 
 def _after(key: NestedKey) -> NestedKey:
@@ -365,7 +379,7 @@ def _hold_out(groups: Tensor, fraction: float, seed: int) -> Tensor:
         piece = max(1, min(wanted, count - wanted, max(_PIECE, wanted // 5)))
         pieces = groups * (count // piece + 1) + rank // piece
         groups, sizes = pieces.unique(return_inverse=True, return_counts=True)[1:]
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(int(seed))
     order = torch.randperm(len(sizes), generator=generator).to(groups.device)
     before = sizes[order].cumsum(0) - sizes[order]
     # Never all of them.

@@ -13,6 +13,7 @@ from gymnasium.spaces import Box, Dict
 from tensordict import TensorDictBase
 from torchrl.data import Bounded
 from torchrl.envs import EnvBase, GymWrapper, StepCounter, TransformedEnv
+from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.envs.utils import step_mdp
 
 from torchrl_l1.control import time_step
@@ -98,15 +99,31 @@ class GymnasiumCell:
     def _observed(self, observation: Any) -> np.ndarray:
         if self._keys:
             observation = np.concatenate([np.ravel(observation[key]) for key in self._keys])
-        return np.asarray(observation, dtype=np.float32)
+        found = np.asarray(observation, dtype=np.float32)
+        if found.size != self.observation_dim:
+            raise ValueError(
+                f"{self._name} returned an observation of shape {found.shape}, and its "
+                f"observation space has {self.observation_dim} entries"
+            )
+        return found.reshape(-1)
 
     def reset(self, seed: int) -> np.ndarray:
         """See :class:`Cell`."""
-        return self._observed(self.env.reset(seed=seed)[0])
+        return self._observed(self._parts("reset", self.env.reset(seed=seed), 2)[0])
+
+    def _parts(self, method: str, returned: Any, count: int) -> tuple[Any, ...]:
+        """What a method returned, which has another form in Gym's old interface."""
+        if not isinstance(returned, tuple) or len(returned) != count:
+            form = {2: "observation, info", 5: "observation, reward, terminated, truncated, info"}
+            raise ValueError(
+                f"{self._name}: {method} does not return ({form[count]}), as Gymnasium has it"
+            )
+        return returned
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
         """See :class:`Cell`."""
-        observation, reward, terminated, truncated, _ = self.env.step(action.astype(self._type))
+        stepped = self._parts("step", self.env.step(action.astype(self._type)), 5)
+        observation, reward, terminated, truncated, _ = stepped
         # Some give an array with one number.
         earned = np.asarray(reward, dtype=np.float64).item()
         return self._observed(observation), earned, bool(terminated), bool(truncated)
@@ -194,14 +211,16 @@ class TorchRLCell:
 
     def horizon(self) -> int | None:
         """See :class:`Cell`."""
-        env, limits = self.env, []
+        env: EnvBase = self.env
+        limits: list[Any] = []
         while isinstance(env, TransformedEnv):
             limits += [t.max_steps for t in env.transform.modules() if isinstance(t, StepCounter)]
             env = env.base_env
-        inner = getattr(env, "_env", None)  # Gymnasium's or dm_control's
-        spec = getattr(inner, "spec", None)
-        limits += [getattr(env, "max_steps", None), getattr(inner, "_step_limit", None)]
-        limits.append(getattr(spec, "max_episode_steps", None))
+        if not isinstance(env, BatchedEnvBase):  # which would ask its members
+            inner = getattr(env, "_env", None)  # Gymnasium's or dm_control's
+            spec = getattr(inner, "spec", None)
+            limits += [getattr(env, "max_steps", None), getattr(inner, "_step_limit", None)]
+            limits.append(getattr(spec, "max_episode_steps", None))
         found = [int(x) for x in limits if isinstance(x, (int, float)) and 0 < x < float("inf")]
         return min(found) if found else None
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymEnv, GymWrapper
 
+from torchrl_l1.checks import check_optional_count
 from torchrl_l1.envs.cells import PAGE, Cell, GymnasiumCell, TorchRLCell
 from torchrl_l1.envs.known_rewards import Outcome
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv, keep_others, stepped_rows
@@ -64,6 +65,7 @@ class ExternalTask:
     ) -> None:
         self.source, self.name = source, source.name or "the environment"
         self._keys = tuple(observation_keys)
+        check_optional_count("horizon", horizon)
         cell = self._cell()
         try:
             self.observation_dim = cell.observation_dim

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,12 +11,13 @@ from typing import Any, TypeAlias
 import gymnasium
 import mujoco
 import torch
-from torchrl.data import Bounded, TensorSpec, Unbounded
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import (
     CatTensors,
     Compose,
     DMControlEnv,
     DoubleToFloat,
+    DTypeCastTransform,
     EnvBase,
     GymEnv,
     GymWrapper,
@@ -245,7 +246,13 @@ def _made(function: Callable[[], Any], name: str = "the function") -> EnvBase:
     """What a function makes, as an environment of TorchRL."""
     made = function()
     if isinstance(made, gymnasium.Env):
-        return GymWrapper(made)
+        try:
+            return GymWrapper(made)
+        except RuntimeError as error:  # of spaces that are mixtures
+            raise ValueError(
+                f"{name} returns a {type(made).__name__}, which TorchRL cannot wrap ({error}): its "
+                f"actions are {made.action_space}, its observations {made.observation_space}"
+            ) from error
     if isinstance(made, Task):
         return BatchedMujocoEnv(made, 1)
     if not isinstance(made, EnvBase):
@@ -297,15 +304,19 @@ def vector_environment(env: EnvBase, keys: Sequence[str] = ()) -> EnvBase:
             or, where that is no part, all.
 
     Raises:
+        TypeError: for an environment of Gymnasium.
         ValueError: if it has no such observation or action.
     """
+    if isinstance(env, gymnasium.Env):
+        name = type(env).__name__
+        raise TypeError(f"{name} is an environment of Gymnasium: torchrl.envs.GymWrapper wraps it")
     actions = list(env.full_action_spec.keys(True, True))
     action = env.full_action_spec["action"] if actions == ["action"] else None
     continuous = isinstance(action, (Bounded, Unbounded)) and action.dtype.is_floating_point
     if action is None or not continuous or action.ndim != len(env.batch_size) + 1:
         raise ValueError(
             f"L1 needs one vector of continuous actions under 'action'; {type(env).__name__} has "
-            f"{env.full_action_spec}"
+            f"{_in_words(env.full_action_spec)}"
         )
     transforms: list[Transform] = []
     found = vectors(env)
@@ -320,18 +331,41 @@ def vector_environment(env: EnvBase, keys: Sequence[str] = ()) -> EnvBase:
                 f"{type(env).__name__} has no vector of floating-point observations, only "
                 f"{sorted(map(str, env.full_observation_spec.keys(True, True)))}"
             )
-        scalars = [key for key, spec in found.items() if spec.ndim == len(env.batch_size)]
-        if scalars:
-            transforms.append(UnsqueezeTransform(-1, in_keys=scalars, out_keys=scalars))
-        parts = list(keys) or sorted(found)
-        transforms.append(CatTensors(parts, "observation", del_keys=False, sort=False))
+        transforms += _joined(env, list(keys) or sorted(found), found)
+        kinds = {spec.dtype for spec in found.values()}
+        is_double = kinds == {torch.float64}
+    else:
+        is_double = found["observation"].dtype == torch.float64
     double = {
-        "in_keys": ["observation"] * any(s.dtype == torch.float64 for s in found.values()),
+        "in_keys": ["observation"] * is_double,
         "in_keys_inv": ["action"] * (action.dtype == torch.float64),
     }
     if any(double.values()):
         transforms.append(DoubleToFloat(**double))
     return TransformedEnv(env, Compose(*transforms), auto_unwrap=True) if transforms else env
+
+
+def _joined(
+    env: EnvBase, keys: Sequence[str], found: Mapping[str, TensorSpec]
+) -> Iterator[Transform]:
+    """Join parts to one observation, without writing to them: a step may read them again."""
+    place = {key: key for key in keys}
+    long = [key for key in keys if found[key].dtype == torch.float64]
+    if 0 < len(long) < len(keys):
+        place |= {key: f"{key}_float32" for key in long}
+        types, there = (torch.float64, torch.float32), [place[key] for key in long]
+        yield DTypeCastTransform(*types, in_keys=long, out_keys=there, in_keys_inv=[])
+    scalars = [key for key in keys if found[key].ndim == len(env.batch_size)]
+    if scalars:
+        before = [place[key] for key in scalars]
+        place |= {key: f"{key}_vector" for key in scalars}
+        yield UnsqueezeTransform(-1, in_keys=before, out_keys=[place[key] for key in scalars])
+    yield CatTensors(list(place.values()), "observation", del_keys=False, sort=False)
+
+
+def _in_words(spec: Composite) -> str:
+    leaves = spec.items(True, True)
+    return ", ".join(f"{key!r}: {type(s).__name__} {list(s.shape)} {s.dtype}" for key, s in leaves)
 
 
 def check_keys(keys: Sequence[str], there: Sequence[str] | Mapping[str, Any], name: str) -> None:
@@ -364,5 +398,6 @@ def simulation_of(env: EnvBase) -> Any:
     """Gymnasium's environment with MuJoCo's ``model`` and ``data``, if it is one; else ``None``."""
     while isinstance(env, TransformedEnv):
         env = env.base_env
-    inner = getattr(getattr(env, "_env", None), "unwrapped", None)
+    # Not getattr, by which a batch asks its members.
+    inner = getattr(env.__dict__.get("_env"), "unwrapped", None)
     return inner if isinstance(getattr(inner, "model", None), mujoco.MjModel) else None
