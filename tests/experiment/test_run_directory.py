@@ -10,7 +10,8 @@ import pytest
 
 from torchrl_l1.experiment.errors import RunDirectoryInUse
 from torchrl_l1.experiment.files import locked
-from torchrl_l1.experiment.run_directory import RunDirectory, commit, differences
+from torchrl_l1.experiment.run_directory import RunDirectory, commit
+from torchrl_l1.experiment.settings import differences
 
 HOLD = """
 import subprocess, sys, time
@@ -128,3 +129,14 @@ def test_files_of_one_name_in_other_folders_are_compared(tmp_path: Path) -> None
     assert found.startswith("search_path: [") and str(tmp_path / "other") in found
     (tmp_path / "one/own.py").unlink()  # a project that has moved
     assert differences(one, other) == []
+
+
+def test_a_run_goes_on_and_is_read_where_its_configuration_is_older_than_its_checkpoint() -> None:
+    """One that a later version has gone on with: only the checkpoint knows the new setting."""
+    newer = {"algorithm": "metrpo", "seed": 0, "threads": 1, "l1": {"enabled": True, "a_s": -1.0}}
+    older = {"algorithm": "metrpo", "seed": 0, "l1": {"enabled": True}}
+    assert differences(newer, older) == [] == differences(older, newer)
+    (found,) = differences({**newer, "threads": 2}, older)
+    assert found == "threads: 2 there, 1 now"
+    (found,) = differences(older, {**newer, "l1": {"enabled": True, "a_s": -2.0}})
+    assert found == "l1.a_s: -1.0 there, -2.0 now"

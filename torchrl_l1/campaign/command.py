@@ -48,6 +48,11 @@ def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> N
         raise OSError(
             f"{output} leads to itself through symbolic links: choose a folder"
         ) from error
+    if "${" in str(output):
+        raise CampaignError(
+            f"{output}: ${{ in a path stands for a setting in the settings of its runs; choose "
+            "another --output"
+        )
     _check_owner(output, campaign)
     # Runs that are reused need no device, so devices are checked once these are known.
     runs = plan(campaign, output, trusted=options.trust)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -126,6 +127,21 @@ def same_code(names: Iterable[str], one: Sequence[str | Path], other: Sequence[s
         if None not in found and len({file.read_bytes() for file in found if file}) > 1:
             return False
     return True
+
+
+def code_digests(names: Iterable[str], folders: Sequence[str | Path]) -> dict[str, str]:
+    """Digests of the files and modules that names begin with, as far as they can be found.
+
+    Args:
+        names: such as ``envs.py:make_env`` or ``my_package:MyEnv-v0``.
+        folders: where to look; after them, the working directory.
+    """
+    found = {}
+    for module in dict.fromkeys(name.rpartition(":")[0] for name in names):
+        file = _file_of(module, (*folders, Path.cwd()))
+        if file is not None:
+            found[module] = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+    return found
 
 
 def _file_of(module: str, folders: Sequence[str | Path]) -> Path | None:

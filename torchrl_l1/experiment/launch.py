@@ -126,6 +126,7 @@ def _check(recipe: Path, overrides: Sequence[str], sweeps: bool, trusted: bool) 
     if not trusted:
         check_data(recipe)
     settings = [*_search_path(recipe), *_HYDRA_SETTINGS]
+    _check_options(recipe, overrides)
     try:
         with _composing(recipe.parent):
             first = _first(overrides) if sweeps else list(overrides)
@@ -281,6 +282,7 @@ def compose(name: str, overrides: Sequence[str] = (), *, trusted: bool = False) 
     register()
     if not trusted:
         check_data(recipe)
+    _check_options(recipe, overrides)
     with _composing(recipe.parent):
         own = [*overrides, *_name(recipe, overrides)]
         config = hydra.compose(recipe.stem, [*_search_path(recipe), *own])
@@ -326,9 +328,33 @@ def _folders_of_code(recipe: Path, config: DictConfig, overrides: Sequence[str])
 def _search_path(recipe: Path) -> list[str]:
     """Where Hydra looks beside the recipe: with its algorithm, in ``shared``, and from the root."""
     folders = [shared_dir(), *_folders(recipe), recipes_dir()]
+    for name, algorithm in _SCHEMA_NAMES.items():
+        own = recipe.parent / f"{name}.yaml"
+        if recipes_dir() / algorithm in folders and own.is_file():
+            raise RecipeError(
+                f"{own} is called like the schema {name}, which recipes beside it would not find; "
+                "rename the file"
+            )
     unique = dict.fromkeys(folder for folder in folders if folder != recipe.parent)
     quoted = ",".join(f"'file://{folder}'" for folder in unique)
     return [f"hydra.searchpath=[{quoted}]"]
+
+
+def _check_options(recipe: Path, overrides: Sequence[str]) -> None:
+    """Refuse several options of a group in one run: the last one would count, and none is told."""
+    folders = [recipe.parent, shared_dir(), *_folders(recipe)]
+    for text in overrides:
+        key, _, value = text.lstrip("+").partition("=")
+        several = value.strip().removeprefix("[").removesuffix("]")
+        if (
+            value.strip().startswith("[")
+            and key
+            and any((folder / key).is_dir() for folder in folders)
+        ):
+            raise RecipeError(
+                f"{text}: a run has one {key}; -m {key}={several.replace(' ', '')} makes a run of "
+                "each, and so does a campaign's matrix"
+            )
 
 
 def _folders(recipe: Path) -> list[Path]:
