@@ -201,7 +201,7 @@ def test_refused_on_the_command_line(
         (["hydra.launcher.n_jobs=2"], "give --launcher"),
         (["noise"], "KEY=VALUE"),
         (["--fast"], "unrecognized arguments: --fast"),
-        (["--output", "${seed}"], "${ in a path stands for a setting"),
+        (["--output", str(tmp_path / "${seed}")], "${ in a path stands for a setting"),
         (["--launcher", "cloud"], "unknown launcher 'cloud'; there are joblib, "),
     ]:
         with pytest.raises(SystemExit) as exit_info:

@@ -147,6 +147,9 @@ def test_online_without_a_key_is_a_line_and_leaves_nothing(
     [
         ("loggers=[wandb,paper]", "loggers must be"),
         ("checkpoint.every=0", r"checkpoint\.every"),
+        ("wandb.project=a/b", "wandb.project: .* cannot contain characters"),
+        ("wandb.tags=['']", "wandb.tags: .* between 1 and 64 characters"),
+        ("wandb.tags=[" + 65 * "x" + "]", "wandb.tags: .* between 1 and 64 characters"),
     ],
 )
 def test_settings_that_cannot_be_meant_are_named(

@@ -24,7 +24,7 @@ from torchrl_l1.checks import check_choice
 from torchrl_l1.experiment.errors import RunDirectoryError, message
 from torchrl_l1.experiment.files import locked, refuse_link
 from torchrl_l1.experiment.run_directory import read_config
-from torchrl_l1.experiment.settings import RunSettings
+from torchrl_l1.experiment.settings import RunSettings, WandbSettings
 from torchrl_l1.experiment.wandb_files import has_ended, known_id, take_over
 
 MODES = ("auto", "online", "offline", "disabled")
@@ -62,10 +62,23 @@ def check_loggers(recipe: RunSettings) -> None:
         check_choice("loggers", name, LOGGERS)
     if "wandb" in recipe.loggers:
         check_wandb_mode(recipe.wandb.mode)
+        _check_words(recipe.wandb)
     if "tensorboard" in recipe.loggers and find_spec("tensorboard") is None:
         raise ValueError(
             "loggers: tensorboard is not installed; pip install 'torchrl-l1[tensorboard]'"
         )
+
+
+def _check_words(settings: WandbSettings) -> None:
+    """Refuse names that W&B would refuse when the run has begun."""
+    for key, field in (("project", "project"), ("tags", "run_tags")):
+        value = getattr(settings, key)
+        try:
+            wandb.Settings(**{field: tuple(value) if key == "tags" else value})
+        except (ValueError, wandb.errors.Error) as error:
+            # Pydantic's has several lines, with an address.
+            why = error.errors()[0]["msg"] if hasattr(error, "errors") else error
+            raise ValueError(f"wandb.{key}: {why}") from error
 
 
 def chosen_mode(mode: str) -> str:
