@@ -164,3 +164,12 @@ def test_a_new_recipe_has_no_facts_that_it_would_be_refused_for(
     source = ["--from", "gymnasium/Pendulum-v1"]
     assert message in refused(["new-task", "mine.yaml", *source, *options], capsys)
     assert not list(Path.cwd().iterdir())
+
+
+@pytest.mark.parametrize(
+    "size", ["horizon=100000000000000000", "episodes_per_iteration=1000000000000"]
+)
+def test_what_no_memory_holds_is_a_line(size: str, capsys: pytest.CaptureFixture[str]) -> None:
+    line = refused([*RUN, "run_dir=here", size], capsys)
+    assert "fit into the memory of this machine" in line and "episodes" in line
+    assert len(line.strip().splitlines()) == 1

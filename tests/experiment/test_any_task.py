@@ -293,11 +293,19 @@ def test_a_run_that_has_gone_on_elsewhere_is_evaluated_with_the_code_that_is_the
     assert len(rows(Path("r/evaluation/evaluation.csv"))) == 1
 
 
-def test_runs_of_changed_code_are_not_reused(place: Path) -> None:
+def test_runs_of_changed_code_are_not_reused_and_told(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     text = 'runs: [{recipe: mine.yaml, overrides: ["' + '", "'.join(TINY) + '"]}]\n'
     (place / "c.yaml").write_text(text)
     main(["campaign", "c.yaml", "--output", "one", "--workers", "1"])
     runs = plan(read_campaign("c.yaml"), place / "two")
     assert len(find_reusable(runs, place / "two", [place / "one"])) == 1
+    command = ["campaign", "c.yaml", "--list", "--output"]
+    main([*command, "one"])
+    assert "has changed" not in capsys.readouterr().err
     (place / "own.py").write_text(PACKAGE.replace("0.1 * np.array", "0.2 * np.array"))
     assert not find_reusable(runs, place / "two", [place / "one"])
+    for folder, told in (("one", 1), ("two", 0)):
+        main([*command, folder])
+        assert capsys.readouterr().err.count("own.py has changed since runs in") == told

@@ -142,6 +142,15 @@ def test_online_without_a_key_is_a_line_and_leaves_nothing(
     assert set(tmp_path.iterdir()) == before
 
 
+def test_a_mode_of_the_environment_that_there_is_not_is_named(
+    tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WANDB_MODE", "of")
+    with pytest.raises(ValueError, match="WANDB_MODE=of: it must be one of online, offline"):
+        run(tiny_recipe("wandb.mode=auto"))
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize(
     ("override", "words"),
     [

@@ -213,7 +213,7 @@ def evaluate_episodes(
     check_plants(trained.algorithm.task, cells)
     check_controllers(trained.recipe.l1, trained.algorithm.task, cells)
     for cell in [replace(cell, stage=trained.stage(cell.stage)) for cell in cells]:
-        with single_precision():
+        with fitting_into_memory(f"an evaluation of {episodes} episodes"), single_precision():
             collection = make_collection(trained, cell, episodes)
             data = collection.evaluate(seed, deterministic=cell.policy == "deterministic")
         place = {

@@ -66,7 +66,7 @@ def run(config: DictConfig) -> Path:
             refuse_link(directory.path / folder)
         if not (recipe.resume and directory.checkpoint_file.exists()):
             algorithm.prepare()
-        with directory.open(settings, recipe.resume):
+        with directory.open(settings, recipe.resume), fitting_into_memory(recipe.recipe):
             _run(algorithm, recipe, settings, directory, progress)
     print(f"Finished: {directory.metrics_file}")
     return directory.path

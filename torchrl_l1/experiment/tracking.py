@@ -29,6 +29,9 @@ from torchrl_l1.experiment.wandb_files import has_ended, known_id, take_over
 
 MODES = ("auto", "online", "offline", "disabled")
 
+# What W&B takes from the environment, older words among it.
+_WANDB_MODES = ("online", "offline", "disabled", "shared", "run", "dryrun")
+
 LOGGERS = ("wandb", "tensorboard")
 """What a recipe's ``loggers`` may name."""
 
@@ -45,6 +48,11 @@ def check_wandb_mode(mode: str) -> None:
     """
     if mode not in MODES:
         raise ValueError(f"wandb.mode must be one of {', '.join(MODES)}, got {mode!r}")
+    here = os.environ.get("WANDB_MODE")
+    if mode == "auto" and here and here not in _WANDB_MODES:
+        raise ValueError(
+            f"WANDB_MODE={here}: it must be one of {', '.join(_WANDB_MODES)}; or set wandb.mode"
+        )
     if mode == "online" and not _has_key():
         raise ValueError(
             "wandb.mode=online needs an API key; log in with wandb login or set WANDB_API_KEY, or "
@@ -72,9 +80,9 @@ def check_loggers(recipe: RunSettings) -> None:
 def _check_words(settings: WandbSettings) -> None:
     """Refuse names that W&B would refuse when the run has begun."""
     for key, field in (("project", "project"), ("tags", "run_tags")):
-        value = getattr(settings, key)
+        given: dict[str, Any] = {field: getattr(settings, key)}
         try:
-            wandb.Settings(**{field: tuple(value) if key == "tags" else value})
+            wandb.Settings(**given)
         except (ValueError, wandb.errors.Error) as error:
             # Pydantic's has several lines, with an address.
             why = error.errors()[0]["msg"] if hasattr(error, "errors") else error
