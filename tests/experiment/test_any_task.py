@@ -269,13 +269,15 @@ def test_code_that_has_changed_since_a_run_began_is_told(
     main(command)
     main([*command, "outer_iterations=2"])
     assert told not in "".join(capsys.readouterr())
-    before = RunDirectory("r").changed_code(OmegaConf.to_container(OmegaConf.load("r/config.yaml")))
+    before = RunDirectory("r").changed_files(
+        OmegaConf.to_container(OmegaConf.load("r/config.yaml"))
+    )
     (place / "own.py").write_text(PACKAGE.replace("0.1 * np.array", "0.2 * np.array"))
     for again in ([*command, "outer_iterations=3"], ["evaluate", "r", "--episodes", "1"]):
         main(again)
         assert told in "".join(capsys.readouterr())
     config = OmegaConf.to_container(OmegaConf.load("r/config.yaml"))
-    assert (before, RunDirectory("r").changed_code(config)) == ([], ["own.py"])
+    assert (before, RunDirectory("r").changed_files(config)) == ([], ["own.py"])
     main(["report", "r", "--output", "out"])
     assert "| own.py | sha256 " in Path("out/report.md").read_text()
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -140,3 +141,21 @@ def test_a_run_goes_on_and_is_read_where_its_configuration_is_older_than_its_che
     assert found == "threads: 2 there, 1 now"
     (found,) = differences(older, {**newer, "l1": {"enabled": True, "a_s": -2.0}})
     assert found == "l1.a_s: -1.0 there, -2.0 now"
+
+
+def test_data_that_have_changed_since_a_run_began_are_known(tmp_path: Path) -> None:
+    """By those who would copy the run; one that goes on has them in its checkpoint."""
+    data, run = tmp_path / "data.npz", RunDirectory(tmp_path / "run")
+    config = {"algorithm": "offline", "task": "hopper", "seed": 0, "dataset": str(data)}
+    data.write_bytes(b"first")
+    with run.open(config, resume=False):
+        pass
+    copy = tmp_path / "copy.npz"
+    shutil.copyfile(data, copy)
+    os.replace(copy, data)  # another file with what was in the first
+    assert run.changed_files(config, data=True) == []
+    data.write_bytes(b"other")
+    assert run.changed_files(config, data=True) == [str(data)]
+    assert run.changed_files(config) == []
+    data.unlink()
+    assert run.changed_files(config, data=True) == []

@@ -57,10 +57,11 @@ def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> N
     # Runs that are reused need no device, so devices are checked once these are known.
     runs = plan(campaign, output, trusted=options.trust)
     begun = [run for run in runs if run.directory.config_file.exists()]
-    for name in sorted({n for run in begun for n in run.directory.changed_code(run.settings())}):
+    changed = {n for run in begun for n in run.directory.changed_files(run.settings(), data=True)}
+    for name in sorted(changed):
         print(
-            f"{name} has changed since runs in {output} began, which stay as they are and go on "
-            "with it; with --output all are trained anew",
+            f"{name} has changed since runs in {output} began, which stay as they are; with "
+            "another --output all are trained anew",
             file=sys.stderr,
         )
     reused = find_reusable(runs, output, [Path(folder) for folder in options.reuse])

@@ -55,7 +55,8 @@ def find_reusable(
             same = [
                 path
                 for path, was in finished.get(_key(now), [])
-                if not differences(was, now) and not RunDirectory(path).changed_code(now)
+                if not differences(was, now)
+                and not RunDirectory(path).changed_files(now, data=True)
             ]
             if same:
                 reused[run.directory.path] = same[0]

@@ -32,7 +32,13 @@ from torchrl_l1.envs.perturbations import (
     suite,
 )
 from torchrl_l1.envs.plant import disturbed_model, wind_force
-from torchrl_l1.envs.references import code_digests, load_attribute, load_module, same_code
+from torchrl_l1.envs.references import (
+    code_digests,
+    file_digest,
+    load_attribute,
+    load_module,
+    same_code,
+)
 from torchrl_l1.envs.sensors import SensorBias, SensorDelay, SensorDropout
 from torchrl_l1.envs.simulation import BatchedSimulator, StartStates, TaskSimulation
 from torchrl_l1.envs.sources import EnvironmentSource, environment_source, vector_environment
@@ -80,6 +86,7 @@ __all__ = [
     "disturbance_transforms",
     "disturbed_model",
     "environment_source",
+    "file_digest",
     "get_task",
     "gymnasium_id",
     "load_attribute",

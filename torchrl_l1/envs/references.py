@@ -140,8 +140,20 @@ def code_digests(names: Iterable[str], folders: Sequence[str | Path]) -> dict[st
     for module in dict.fromkeys(name.rpartition(":")[0] for name in names):
         file = _file_of(module, (*folders, Path.cwd()))
         if file is not None:
-            found[module] = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+            found[module] = file_digest(file)
     return found
+
+
+def file_digest(file: Path) -> str:
+    """The first digits of a file's SHA-256; it is read again where its time or size is another."""
+    about = file.stat()
+    return _digest(file.resolve(), about.st_mtime_ns, about.st_size)
+
+
+@cache
+def _digest(file: Path, changed: int, size: int) -> str:
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()[:16]
 
 
 def _file_of(module: str, folders: Sequence[str | Path]) -> Path | None:

@@ -19,6 +19,7 @@ import yaml  # type: ignore[import-untyped]
 from omegaconf import OmegaConf
 
 import torchrl_l1
+from torchrl_l1.envs import file_digest
 from torchrl_l1.experiment.checkpoints import read_checkpoint
 from torchrl_l1.experiment.errors import RunDirectoryError, RunDirectoryInUse, message
 from torchrl_l1.experiment.files import (
@@ -153,7 +154,7 @@ class RunDirectory:
             if not ours:
                 raise RunDirectoryInUse(f"another process is running in {self.path}")
             if not self.config_file.exists():
-                found = {**versions(), **code_versions(config)}
+                found = {**versions(), **code_versions(config), **_data_version(config)}
                 write_atomically(self.versions_file, json.dumps(found, indent=2))
             stored = self._stored()
             # Folders of the user's code may have moved; what evaluates the run looks there, too.
@@ -295,7 +296,7 @@ class RunDirectory:
         if state is not None and problems:
             done = len(state["metrics"])
             say(f"{problems[0]}; {self.previous_file.name} is used, of {done} iterations")
-        for name in self.changed_code(config or self._stored()) if state is not None else ():
+        for name in self.changed_files(config or self._stored()) if state is not None else ():
             say(f"{name} is not as it was when the run in {self.path} began; it is used as it is")
         if state is None and self._has_results():
             raise RunDirectoryError(
@@ -306,14 +307,20 @@ class RunDirectory:
             say(f"{problems[0]}; the run starts over")
         return state
 
-    def changed_code(self, config: Mapping[str, Any]) -> list[str]:
-        """Files of the user's that ``config`` names and that have changed since the run began."""
+    def changed_files(self, config: Mapping[str, Any], data: bool = False) -> list[str]:
+        """Files of the user's that ``config`` names and that have changed since the run began.
+
+        Args:
+            config: of the run.
+            data: whether the dataset is one of them; a run that goes on has its data already.
+        """
         try:
             began = json.loads(read_text(self.versions_file))
         except (OSError, ValueError, RecursionError):
             return []
         known = began if isinstance(began, dict) else {}
-        return [n for n, code in code_versions(config).items() if known.get(n, code) != code]
+        found = {**code_versions(config), **(_data_version(config) if data else {})}
+        return [name for name, version in found.items() if known.get(name, version) != version]
 
     def load_kept(self, file: Path) -> dict[str, Any]:
         """A checkpoint that the run has kept.
@@ -416,6 +423,12 @@ class RunDirectory:
             self.checksums_file: json.dumps(checksums, indent=2).encode(),
             self.metrics_file: texts[self.metrics_file].encode(),
         }
+
+
+def _data_version(config: Mapping[str, Any]) -> dict[str, str]:
+    """The digest of the dataset that an offline run names, where it is a file."""
+    file = Path(str(config.get("dataset") or ""))
+    return {str(config["dataset"]): f"sha256 {file_digest(file)}"} if file.is_file() else {}
 
 
 def _shortened(items: Sequence[str], most: int = 8) -> str:
