@@ -16,7 +16,7 @@ import yaml  # type: ignore[import-untyped]
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import IntervalSweep
+from hydra.core.override_parser.types import Glob, IntervalSweep
 from hydra.errors import CompactHydraException, HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -90,9 +90,9 @@ def launch(name: str, arguments: Sequence[str]) -> None:
     register()
     flags, overrides = split_flags([text for text in arguments if text != "--trust"])
     if not any(flag.partition("=")[0] in _OWN_WAYS for flag in flags):
-        config = _check(
-            recipe, overrides, "-m" in flags or "--multirun" in flags, "--trust" in arguments
-        )
+        sweeps = "-m" in flags or "--multirun" in flags
+        overrides = _spelled_out(recipe, overrides) if sweeps else overrides
+        config = _check(recipe, overrides, sweeps, "--trust" in arguments)
         overrides += _search_path_override(recipe, config, overrides)
     before = sys.argv
     settings = [*_search_path(recipe), *_HYDRA_SETTINGS]
@@ -167,6 +167,27 @@ def _composed(name: str | None, overrides: list[str]) -> DictConfig:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Hydra says it again when it runs
         return application.compose_config(name, overrides, run_mode=RunMode.RUN, from_shell=False)
+
+
+def _spelled_out(recipe: Path, overrides: Sequence[str]) -> list[str]:
+    """Overrides with the options that a glob matches: Hydra knows those beside the recipe only."""
+    folders = [recipe.parent, shared_dir(), *_folders(recipe)]
+    found = []
+    for text in overrides:
+        key, _, value = text.partition("=")
+        if value.startswith("glob("):
+            try:
+                pattern = OverridesParser.create().parse_overrides([text])[0].value()
+            except HydraException as error:
+                raise RecipeError(message(error)) from error
+            assert isinstance(pattern, Glob)
+            files = (file for folder in folders for file in (folder / key).glob("*.yaml"))
+            options = pattern.filter(sorted({file.stem for file in files}))
+            if not options:
+                raise RecipeError(f"{text} matches nothing, so there is nothing to run")
+            text = f"{key}={','.join(options)}"
+        found.append(text)
+    return found
 
 
 def _first(overrides: Sequence[str]) -> list[str]:
