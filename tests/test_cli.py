@@ -138,3 +138,38 @@ def test_a_closed_pipe_is_told_in_a_line() -> None:
     os.close(write)
     assert ended.returncode == 1
     assert ended.stderr == "torchrl-l1 recipes: what reads the output has ended\n"
+
+
+@pytest.mark.parametrize("more", [[], ["-m", "seed=0,1"]])
+def test_a_run_has_one_option_of_a_group(
+    more: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A list as in a campaign's matrix was one run with all of them, of which the last counts."""
+    line = refused([*RUN, "run_dir=here", "l1=[off, paper]", *more], capsys)
+    assert "l1=[off, paper]: a run has one l1; -m l1=off,paper makes a run of each" in line
+    assert not list(Path.cwd().iterdir())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--dt", "nan"], "--dt must be finite and positive, got nan"),
+        (["--horizon", "0"], "--horizon must be at least 1, got 0"),
+        (["--horizon", "-5"], "--horizon must be at least 1, got -5"),
+    ],
+)
+def test_a_new_recipe_has_no_facts_that_it_would_be_refused_for(
+    options: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = ["--from", "gymnasium/Pendulum-v1"]
+    assert message in refused(["new-task", "mine.yaml", *source, *options], capsys)
+    assert not list(Path.cwd().iterdir())
+
+
+@pytest.mark.parametrize(
+    "size", ["horizon=100000000000000000", "episodes_per_iteration=1000000000000"]
+)
+def test_what_no_memory_holds_is_a_line(size: str, capsys: pytest.CaptureFixture[str]) -> None:
+    line = refused([*RUN, "run_dir=here", size], capsys)
+    assert "fit into the memory of this machine" in line and "episodes" in line
+    assert len(line.strip().splitlines()) == 1

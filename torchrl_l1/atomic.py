@@ -20,7 +20,7 @@ def write_atomically(file: Path, content: str | bytes, keep: Path | None = None)
 
     Args:
         file: the file.
-        content: all of it.
+        content: all of it; text as UTF-8, with the bytes of paths escaped that are none.
         keep: where the file stays that is replaced; there is one or the other at any moment.
 
     Raises:
@@ -31,7 +31,7 @@ def write_atomically(file: Path, content: str | bytes, keep: Path | None = None)
     try:
         temporary.unlink(missing_ok=True)
         with os.fdopen(os.open(temporary, flags, 0o666), "wb") as handle:
-            handle.write(content.encode() if isinstance(content, str) else content)
+            handle.write(content if isinstance(content, bytes) else _utf8(content))
             handle.flush()
             os.fsync(handle.fileno())
         if keep is not None and file.exists():
@@ -41,6 +41,10 @@ def write_atomically(file: Path, content: str | bytes, keep: Path | None = None)
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
         raise type(error)(error.errno, error.strerror, str(file)) from error
+
+
+def _utf8(text: str) -> bytes:
+    return text.encode(errors="backslashreplace")
 
 
 def write_through(file: Path, write: Callable[[io.BytesIO], object]) -> None:

@@ -129,6 +129,11 @@ def test_a_users_recipe_is_found_beside_the_campaign(write: Any, tmp_path: Path)
         (RUNS.replace("[0, 1]", "[]"), "matrix.seed must be a list of values"),
         (RUNS.replace("[0, 1]", "[0, 0]"), "names a value twice: 0, 0"),
         (RUNS.replace("[0, 1]", "[many]"), "seed"),
+        (RUNS.replace("[0, 1]", "[010]"), "line 1, .*: 010 means 8 in YAML; write 8, or '010'"),
+        (RUNS.replace("[0, 1]", "[1:30]"), "1:30 means 90 in YAML"),
+        (RUNS + "evaluations: [{name: e, bias: [-01]}]", "-01 means -1 in YAML"),
+        (RUNS.replace("matrix", "overrides: ['noise=[action, both]'], matrix"),
+         r"a run has one noise; -m noise=action,both .* campaign's matrix"),
         (RUNS.replace("paper", "../up"), "cannot name a folder"),
         (RUNS.replace("paper", "[8]"), "matrix.l1 holds"),
         (RUNS.replace("paper", "papr"), "papr"),
@@ -196,6 +201,7 @@ def test_refused_on_the_command_line(
         (["hydra.launcher.n_jobs=2"], "give --launcher"),
         (["noise"], "KEY=VALUE"),
         (["--fast"], "unrecognized arguments: --fast"),
+        (["--output", str(tmp_path / "${seed}")], "${ in a path stands for a setting"),
         (["--launcher", "cloud"], "unknown launcher 'cloud'; there are joblib, "),
     ]:
         with pytest.raises(SystemExit) as exit_info:
@@ -322,6 +328,7 @@ def test_what_is_written_is_read_again(values: list[Any], tmp_path: Path) -> Non
         ("off", "off"), ("On", "On"), ("yes", "yes"), ("none", "none"), ("true", True),
         ("False", False), ("1e-3", 1e-3), ("1E5", 1e5), ("-.5", -0.5), ("3", 3), ("1.", 1.0),
         ("0.10", 0.1), ("e5", "e5"), ("'off'", "off"), ("null", None), ("1-2", "1-2"),
+        ("'010'", "010"), ("0x10", 16), ("1_000", 1000), ("-0", 0),
     ],
 )  # fmt: skip
 def test_words_and_numbers(text: str, value: object, tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.matrix import suite
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.run_directory import RunDirectory
+from torchrl_l1.report.runs import find_readable_runs
 
 TINY = [
     *("outer_iterations=4", "shooting_iterations=1", "cloning.iterations=2", "horizon=8"),
@@ -197,3 +198,31 @@ def test_steps_are_those_that_the_algorithm_counts(
     assert [planned.collected_steps(i) for i in range(planned.iterations + 1)] == [
         count - random for count in (random, *counted)
     ]
+
+
+@pytest.mark.parametrize("spoilt", ["damaged.csv", "episodes/damaged.csv"])
+def test_a_damaged_table_is_made_again_and_not_reported(
+    spoilt: str, tiny_recipe: Callable[..., DictConfig]
+) -> None:
+    """Each is a table as before: without its last line, or with another digit."""
+    directory = run(tiny_recipe("l1=off", "outer_iterations=1"))
+    settings = EvaluationSettings("damaged", matrix={"l1": ["off"], "bias": [0.0, 1.0]}, episodes=2)
+    evaluate_run(str(directory), settings.name, settings.of_a_run())
+    file = directory / "evaluations" / spoilt
+    whole = file.read_text()
+
+    def seen() -> tuple[bool, bool]:
+        found = find_readable_runs([directory])
+        told = [error for error in found.errors if "damaged.csv or the table" in str(error)]
+        assert bool(found.runs[0].evaluations) != bool(told)
+        return is_evaluated(RunDirectory(directory), settings), not told
+
+    assert seen() == (True, True)
+    for text in (whole[: whole.rindex("\n", 0, -1) + 1], whole.replace("1.0", "1.1", 1)):
+        file.write_text(text)
+        assert seen() == (False, False)
+    file.write_bytes(whole.replace("\n", "\r\n").encode())  # as some tools copy text
+    assert seen() == (True, True)
+    file.write_text("")
+    evaluate_run(str(directory), settings.name, settings.of_a_run())
+    assert seen() == (True, True) and file.read_text() == whole

@@ -275,7 +275,8 @@ def test_evaluation_made_again_while_it_is_copied_is_made_here_too(
     monkeypatch.setattr(reuse, "read_config", change)
     copy_run(first.directory.path, this)
     (settings,) = this.evaluations
-    assert is_evaluated(first.directory, settings)
+    # A table with another line is not the one that its settings have the checksum of.
+    assert is_evaluated(first.directory, settings) == (changed == "noisy.yaml")
     assert not is_evaluated(this.directory, settings)
 
 

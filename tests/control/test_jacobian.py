@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
@@ -12,6 +14,8 @@ from torchrl_l1.control import (
     L1Config,
     L1Controller,
     L1Transform,
+    augment,
+    init,
 )
 from torchrl_l1.dynamics import EnsembleDynamics
 
@@ -265,3 +269,18 @@ def test_every_face_takes_what_the_model_predicts(net):
         torch.testing.assert_close(face.model.value(observation, action), net(observation, action))
     with pytest.raises(ValueError, match="ActionJacobian has predicts='change'"):
         L1Transform(ActionJacobian(net), config, predicts="next_observation")
+
+
+@pytest.mark.parametrize("preset", [L1Config.paper, L1Config.robust])
+@pytest.mark.filterwarnings("ignore:estimator='weighted' knows no covariance")
+def test_a_batch_without_rows_is_no_first_step(net: Net, preset: Callable[..., L1Config]) -> None:
+    """Nothing can be told of a model by it; the first one with rows is looked at."""
+    jacobian, config = ActionJacobian(net), preset(0.05, action_low=-1.0, action_high=1.0)
+    for size in (0, 2, 0):
+        observation, action = data(size)
+        action = action.clamp(-1, 1)
+        state = init([size], N, M, config, dtype=torch.float64)
+        executed, state, _ = augment(config, jacobian, state, observation, action)
+        torch.testing.assert_close(executed, action)  # nothing to counteract at a first step
+        assert jacobian.ready == (size == 2 or jacobian.ready)
+    assert jacobian.ready

@@ -8,6 +8,7 @@ import pytest
 import wandb
 
 from torchrl_l1.cli import main, robustify
+from torchrl_l1.deployment import robust_controller
 from torchrl_l1.envs import suite
 from torchrl_l1.experiment.evaluate import TrainedRun
 from torchrl_l1.experiment.settings import METRPORecipe
@@ -75,6 +76,28 @@ def test_from_a_policy_to_a_controller_that_python_loads(policy_file, tmp_path, 
 def test_refusals_of_one_line(line, message, capsys, monkeypatch):
     monkeypatch.setenv("DISPLAY", ":0")
     assert message in refused(shlex.split(line), capsys)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--epsilon", "-1"], "epsilon must be finite and not negative, got -1"),
+        (["--bias", "0.5", "-inf"], "--bias must be finite, got -inf"),
+        (["--delay", "0.5"], "--delay: "),
+        (["--mass", "-1"], "--mass: mass must be positive"),
+        (["--mass", "2"], "mass changes the plant"),
+    ],
+)
+def test_what_cannot_be_tested_is_refused_before_data_are_collected(
+    options, message, policy_file, monkeypatch, capsys
+):
+    def collect(*arguments):
+        raise AssertionError("data are collected")
+
+    monkeypatch.setattr(robust_controller, "collect", collect)
+    env = "gymnasium/Pendulum-v1" if options == ["--mass", "2"] else "inverted_pendulum"
+    policy = f"{policy_file}:balance"
+    assert message in refused(["robustify", env, "--policy", policy, *options], capsys)
 
 
 def test_what_a_training_s_policy_is_worth_is_logged_to_the_training(tmp_path, monkeypatch):

@@ -39,6 +39,13 @@ def test_exported_programs_can_do_without_the_policy(robust, tmp_path):
     assert found.inputs[:2] == ("observation", "u_rl") and found.error < 1e-5
 
 
+def test_as_many_steps_are_named_as_were_compared(robust, tmp_path):
+    """An episode ends before, after 100 steps at the latest."""
+    found = export(robust, tmp_path / "policy.pt", steps=5000)
+    data = robust.wrap(robust.source.one()).rollout(5000, robust.policy)
+    assert 1 <= found.steps <= 100 == max(100, data.shape[-1])
+
+
 def test_onnx_acts_as_the_original(robust, tmp_path):
     for name in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(name)

@@ -17,6 +17,7 @@ from torchrl_l1.campaign.plan import plan
 from torchrl_l1.campaign.reuse import find_reusable
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.launch import compose
+from torchrl_l1.experiment.run_directory import RunDirectory
 
 PACKAGE = """
 import gymnasium
@@ -257,3 +258,56 @@ def test_runs_of_another_folders_file_are_not_reused(
         runs = plan(read_campaign("study.yaml", []), output)
         found.append(len(find_reusable(runs, output, [place / "study"])))
     assert found == [1, 0]
+
+
+def test_code_that_has_changed_since_a_run_began_is_told(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In the same file, where there is no other folder to compare it with."""
+    command = ["run", "mine.yaml", *TINY, "run_dir=r", "--resume"]
+    told = "own.py is not as it was when the run in r began; it is used as it is"
+    main(command)
+    main([*command, "outer_iterations=2"])
+    assert told not in "".join(capsys.readouterr())
+    before = RunDirectory("r").changed_files(
+        OmegaConf.to_container(OmegaConf.load("r/config.yaml"))
+    )
+    (place / "own.py").write_text(PACKAGE.replace("0.1 * np.array", "0.2 * np.array"))
+    for again in ([*command, "outer_iterations=3"], ["evaluate", "r", "--episodes", "1"]):
+        main(again)
+        assert told in "".join(capsys.readouterr())
+    config = OmegaConf.to_container(OmegaConf.load("r/config.yaml"))
+    assert (before, RunDirectory("r").changed_files(config)) == ([], ["own.py"])
+    main(["report", "r", "--output", "out"])
+    assert "| own.py | sha256 " in Path("out/report.md").read_text()
+
+
+def test_a_run_that_has_gone_on_elsewhere_is_evaluated_with_the_code_that_is_there(
+    place: Path,
+) -> None:
+    main(["run", "mine.yaml", *TINY, "run_dir=r"])
+    (place / "moved").mkdir()
+    for name in ("own.py", "mine.yaml"):
+        (place / name).rename(place / "moved" / name)
+    main(["run", "moved/mine.yaml", *TINY, "run_dir=r", "--resume"])
+    assert OmegaConf.load("r/config.yaml").search_path == [str(place / "moved")]
+    main(["evaluate", "r", "--episodes", "1", "--l1", "off"])
+    assert len(rows(Path("r/evaluation/evaluation.csv"))) == 1
+
+
+def test_runs_of_changed_code_are_not_reused_and_told(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = 'runs: [{recipe: mine.yaml, overrides: ["' + '", "'.join(TINY) + '"]}]\n'
+    (place / "c.yaml").write_text(text)
+    main(["campaign", "c.yaml", "--output", "one", "--workers", "1"])
+    runs = plan(read_campaign("c.yaml"), place / "two")
+    assert len(find_reusable(runs, place / "two", [place / "one"])) == 1
+    command = ["campaign", "c.yaml", "--list", "--output"]
+    main([*command, "one"])
+    assert "has changed" not in capsys.readouterr().err
+    (place / "own.py").write_text(PACKAGE.replace("0.1 * np.array", "0.2 * np.array"))
+    assert not find_reusable(runs, place / "two", [place / "one"])
+    for folder, told in (("one", 1), ("two", 0)):
+        main([*command, folder])
+        assert capsys.readouterr().err.count("own.py has changed since runs in") == told

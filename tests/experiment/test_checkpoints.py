@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import DictConfig
 
+from tests.attack.kills import METRPO_TINY, PETS_TINY
 from torchrl_l1.cli import main
 from torchrl_l1.deployment import load_target
 from torchrl_l1.experiment.checkpoints import (
@@ -22,7 +23,9 @@ from torchrl_l1.experiment.checkpoints import (
     read_checkpoint,
 )
 from torchrl_l1.experiment.errors import RunDirectoryError
-from torchrl_l1.experiment.evaluate import load_run
+from torchrl_l1.experiment.evaluate import evaluate, load_run
+from torchrl_l1.experiment.launch import compose
+from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.experiment.run import run
 
 Recipe = Callable[..., DictConfig]
@@ -137,3 +140,30 @@ def test_the_best_that_is_gone_is_told(tmp_path: Path) -> None:
     keep_checkpoints(last, CheckpointSettings(best=True), rows[:2], told.append)
     keep_checkpoints(last, CheckpointSettings(best=True), rows, told.append)
     assert (tmp_path / "checkpoints/best.pt").exists() and told == [line]
+
+
+@pytest.mark.parametrize("recipe", ["metrpo", "pets"])
+def test_the_type_that_a_session_has_chosen_changes_no_run(recipe: str, tmp_path: Path) -> None:
+    """Where a notebook computes in double precision, a run goes on and is tested as it began."""
+    tiny = {"metrpo": METRPO_TINY, "pets": PETS_TINY}[recipe]
+    one, two = (
+        compose(f"{recipe}/inverted_pendulum", [*tiny, f"run_dir={tmp_path / name}"])
+        for name in ("one", "two")
+    )
+    one.outer_iterations = two.outer_iterations = 2
+    run(one)
+    cells = [Condition(l1, disturbances={"bias": 0.5}) for l1 in ("paper", "robust")]
+    expected = list(evaluate(load_run(one.run_dir), cells, 2))
+    two.outer_iterations = 1
+    run(two)
+    two.outer_iterations, two.resume = 2, True
+    torch.set_default_dtype(torch.float64)
+    try:
+        run(two)
+        found = list(evaluate(load_run(two.run_dir), cells, 2))
+        assert torch.get_default_dtype() == torch.float64
+    finally:
+        torch.set_default_dtype(torch.float32)
+    for name in ("metrics.csv", "model.pt"):
+        assert Path(two.run_dir, name).read_bytes() == Path(one.run_dir, name).read_bytes()
+    assert [{**row, "run": ""} for row in found] == [{**row, "run": ""} for row in expected]

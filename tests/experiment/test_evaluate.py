@@ -116,6 +116,39 @@ def test_a_folder_that_takes_no_results_is_told_before_the_work(
     assert not list((tmp_path / "out").iterdir())
 
 
+def test_an_option_may_stand_several_times(tiny_recipe: Recipe) -> None:
+    """With numbers as calculators write them, which begin like options."""
+    directory = run(tiny_recipe("l1=off", "outer_iterations=1"))
+    options = ["--l1", "off", "--episodes", "1", "--policy", "stochastic"]
+    main(["evaluate", str(directory), *options, "--bias", "-1e-1", "--gain", "0.5", "--bias", "2"])
+    rows = rows_of(directory / "evaluation" / "evaluation.csv")
+    tested = [(float(row["bias"]), float(row["gain"])) for row in rows]
+    assert tested == [(-0.1, 1.0), (2.0, 1.0), (0.0, 0.5)]
+
+
+def test_pictures_of_another_evaluation_do_not_stay(tiny_recipe: Recipe, tmp_path: Path) -> None:
+    directory, output = run(tiny_recipe("l1=off", "outer_iterations=1")), tmp_path / "out"
+    output.mkdir()
+    for name in ("returns.png", "recovered.png", "robustness.png", "filmstrip.png", "mine.png"):
+        (output / name).write_text("of another one")
+    options = ["--l1", "off", "--episodes", "1", "--output", str(output)]
+    main(["evaluate", str(directory), *options])
+    assert {file.name for file in output.glob("*.png")} == {"robustness.png", "mine.png"}
+    assert matplotlib.image.imread(output / "robustness.png").std() > 0
+
+
+def test_a_path_that_is_no_utf8_costs_no_evaluation(tiny_recipe: Recipe, tmp_path: Path) -> None:
+    directory = run(tiny_recipe("l1=off", "outer_iterations=1"))
+    try:
+        moved = directory.rename(tmp_path / os.fsdecode(b"caf\xe9"))
+    except OSError:
+        pytest.skip("the file system takes no such name")
+    main(["evaluate", str(moved), "--l1", "off", "--episodes", "1"])
+    rows = rows_of(moved / "evaluation" / "evaluation.csv")
+    assert {row["run"] for row in rows} == {str(tmp_path / "caf\\udce9")}
+    assert all(float(row["return_mean"]) < 0 for row in rows)
+
+
 def test_a_copy_of_a_run_is_no_second_seed(
     tiny_recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

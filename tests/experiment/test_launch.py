@@ -141,6 +141,8 @@ def test_a_key_that_no_schema_knows_is_refused_with_a_plus_too(
         (["-m", "label=both"], "label must be"),
         (["-m", "seed=range(3,3)"], "matches nothing"),
         (["-m", "l1=glob(zz*)"], "matches nothing"),
+        (["-m", "l1=glob(*"], "l1=glob("),
+        (["-m", "nothing=glob(*)"], "matches nothing"),
         (["-m", "discount=interval(0.9,0.99)"], "interval"),
         (["l1.alpha=0.1", "l1.cutoff=3"], "cutoff"),
         (["-m", "l1.alpha=0.1", "l1.cutoff=3"], "cutoff"),
@@ -254,3 +256,19 @@ def test_hydras_optuna_sweeper_looks_for_the_best_return(
             returns += [float(row["return_mean"]) for row in csv.DictReader(file)]
     assert len(returns) == 2
     assert best["best_value"] == pytest.approx(max(returns))
+
+
+def test_a_sweep_by_a_pattern_runs_every_option_of_a_group(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of those that algorithms share, too, which are not beside the recipe."""
+    monkeypatch.chdir(tmp_path)
+    ran = []
+    monkeypatch.setattr(
+        "torchrl_l1.experiment.launch.run",
+        lambda config: ran.append((config.l1.enabled, config.perturbation.action_noise)),
+    )
+    monkeypatch.setattr("torchrl_l1.experiment.launch.final_return", lambda run_dir: 0.0)
+    patterns = ["l1=glob([o*,paper])", "noise=glob(*,exclude=[both,o*])"]
+    main(["run", "metrpo/inverted_pendulum", "-m", *patterns])
+    assert ran == [(False, 0.1), (False, 0.0), (True, 0.1), (True, 0.0)]

@@ -241,6 +241,17 @@ def test_a_users_own_recipe_inherits_a_shipped_one_by_a_line(tmp_path: Path) -> 
     assert typed(str(own), "recipe=other").recipe == "other"
 
 
+def test_a_recipe_that_is_called_like_a_schema_is_named(tmp_path: Path) -> None:
+    """Hydra takes the file for the schema, and would say that it is nested too deeply."""
+    (tmp_path / "metrpo_recipe.yaml").write_text("defaults: [/metrpo_recipe, _self_]\n")
+    (tmp_path / "mine.yaml").write_text("defaults: [metrpo/swimmer, _self_]\n")
+    (tmp_path / "pets.yaml").write_text("defaults: [pets/half_cheetah, _self_]\n")
+    for name in ("metrpo_recipe", "mine"):
+        with pytest.raises(RecipeError, match=r"metrpo_recipe.yaml is called like the schema"):
+            compose(str(tmp_path / f"{name}.yaml"))
+    assert compose(str(tmp_path / "pets.yaml")).recipe == "pets"
+
+
 @pytest.mark.parametrize("entry", ["l1: off", "override l1: off", "l1: no"])
 def test_an_option_that_yaml_takes_for_false_is_named(entry: str, tmp_path: Path) -> None:
     own = tmp_path / "mine.yaml"

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -10,7 +11,8 @@ import pytest
 
 from torchrl_l1.experiment.errors import RunDirectoryInUse
 from torchrl_l1.experiment.files import locked
-from torchrl_l1.experiment.run_directory import RunDirectory, commit, differences
+from torchrl_l1.experiment.run_directory import RunDirectory, commit
+from torchrl_l1.experiment.settings import differences
 
 HOLD = """
 import subprocess, sys, time
@@ -128,3 +130,32 @@ def test_files_of_one_name_in_other_folders_are_compared(tmp_path: Path) -> None
     assert found.startswith("search_path: [") and str(tmp_path / "other") in found
     (tmp_path / "one/own.py").unlink()  # a project that has moved
     assert differences(one, other) == []
+
+
+def test_a_run_goes_on_and_is_read_where_its_configuration_is_older_than_its_checkpoint() -> None:
+    """One that a later version has gone on with: only the checkpoint knows the new setting."""
+    newer = {"algorithm": "metrpo", "seed": 0, "threads": 1, "l1": {"enabled": True, "a_s": -1.0}}
+    older = {"algorithm": "metrpo", "seed": 0, "l1": {"enabled": True}}
+    assert differences(newer, older) == [] == differences(older, newer)
+    (found,) = differences({**newer, "threads": 2}, older)
+    assert found == "threads: 2 there, 1 now"
+    (found,) = differences(older, {**newer, "l1": {"enabled": True, "a_s": -2.0}})
+    assert found == "l1.a_s: -1.0 there, -2.0 now"
+
+
+def test_data_that_have_changed_since_a_run_began_are_known(tmp_path: Path) -> None:
+    """By those who would copy the run; one that goes on has them in its checkpoint."""
+    data, run = tmp_path / "data.npz", RunDirectory(tmp_path / "run")
+    config = {"algorithm": "offline", "task": "hopper", "seed": 0, "dataset": str(data)}
+    data.write_bytes(b"first")
+    with run.open(config, resume=False):
+        pass
+    copy = tmp_path / "copy.npz"
+    shutil.copyfile(data, copy)
+    os.replace(copy, data)  # another file with what was in the first
+    assert run.changed_files(config, data=True) == []
+    data.write_bytes(b"other")
+    assert run.changed_files(config, data=True) == [str(data)]
+    assert run.changed_files(config) == []
+    data.unlink()
+    assert run.changed_files(config, data=True) == []

@@ -142,11 +142,23 @@ def test_online_without_a_key_is_a_line_and_leaves_nothing(
     assert set(tmp_path.iterdir()) == before
 
 
+def test_a_mode_of_the_environment_that_there_is_not_is_named(
+    tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WANDB_MODE", "of")
+    with pytest.raises(ValueError, match="WANDB_MODE=of: it must be one of online, offline"):
+        run(tiny_recipe("wandb.mode=auto"))
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize(
     ("override", "words"),
     [
         ("loggers=[wandb,paper]", "loggers must be"),
         ("checkpoint.every=0", r"checkpoint\.every"),
+        ("wandb.project=a/b", "wandb.project: .* cannot contain characters"),
+        ("wandb.tags=['']", "wandb.tags: .* between 1 and 64 characters"),
+        ("wandb.tags=[" + 65 * "x" + "]", "wandb.tags: .* between 1 and 64 characters"),
     ],
 )
 def test_settings_that_cannot_be_meant_are_named(

@@ -166,6 +166,20 @@ def test_campaign_with_overrides_is_repeated_from_its_file(campaign: Path) -> No
     assert expected in report([campaign]).read_text()
 
 
+def test_a_campaign_within_another_counts_its_own_runs(write_run: WriteRun, tmp_path: Path) -> None:
+    """The outer one without a matrix, as a file by hand may be: one run."""
+    for name, seed in (("seed_0", 0), ("inner/seed_1", 1), ("inner/seed_2", 2)):
+        write_run([-9, -8, -7], seed=seed, name=name)
+    inner = "name: inner\nruns: [{recipe: metrpo/hopper, matrix: {seed: [1, 2, 3]}}]\n"
+    (tmp_path / "runs" / "inner" / "campaign.yaml").write_text(inner)
+    outer = "name: outer\nruns: [{recipe: metrpo/hopper}]\n"
+    (tmp_path / "runs" / "campaign.yaml").write_text(outer)
+    text = report([tmp_path / "runs"]).read_text()
+    assert "**outer** (1 of 1 runs finished)" in text
+    assert "**inner** (2 of 3 runs finished, 1 not begun)" in text
+    assert "cannot be read" not in text
+
+
 def test_comparisons_say_the_settings_of_each_cell(write_run: WriteRun, tmp_path: Path) -> None:
     # The two tasks have other main epsilons: the same departure is another variant in each.
     for recipe, usual in (("metrpo/inverted_pendulum", "1.0"), ("metrpo/swimmer", "2.0")):

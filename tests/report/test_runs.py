@@ -58,6 +58,8 @@ def spoil(file: Path, before: str, after: str) -> None:
         ("evaluations/ablation.csv", "bias", "offset", "no column bias"),
         ("evaluations/ablation.csv", "paper", "", "line 2: l1 is empty"),
         ("evaluations/ablation.csv", "none,0,", "none,0,5,", "line 2: more values than the 7"),
+        ("evaluations/ablation.csv", "gain", "bias", "has the column bias twice"),
+        ("metrics.csv", "policy/std", "return_mean", "has the column return_mean twice"),
         ("evaluations/ablation.csv", "-1,25", "-1,25\npaper,none,0,1,stochastic,-2,25", "line 3"),
     ],
 )
@@ -101,7 +103,7 @@ def test_a_folder_that_cannot_be_looked_into_is_listed(
 
 def test_what_a_table_repeats_counts_once(write_run: WriteRun, tmp_path: Path) -> None:
     row = {"l1": "paper", "noise": "none", "bias": 0, "gain": 1, "policy": "stochastic"}
-    table = [row | {"return_mean": -1, "episodes": 2}]
+    table = [row | {"return_mean": -0.5, "episodes": 2}]
     episodes = [row | {"episode": number, "return": -number} for number in (0, 1)]
     tests = {"mine": 2 * table, "episodes/mine": 2 * episodes}
     write_run([-9], evaluations=tests)
@@ -194,3 +196,17 @@ def test_nothing_to_report_is_refused(tmp_path: Path) -> None:
         find_runs([tmp_path])
     with pytest.raises(FileNotFoundError, match="there is no folder"):
         find_runs([tmp_path / "nowhere"])
+
+
+def test_episodes_of_another_evaluation_are_told(write_run: WriteRun, tmp_path: Path) -> None:
+    """A kill, or a copy by hand, has left the episodes of one beside the table of another."""
+    row = {"l1": "paper", "noise": "none", "bias": 0, "gain": 1, "policy": "stochastic"}
+    table = [row | {"return_mean": 2.0, "episodes": 3}]
+    for seed, returns in enumerate(([1.0, 2.0, 3.0], [10.0, 20.0, 30.0], [2.0, 2.0])):
+        episodes = [row | {"episode": i, "return": value} for i, value in enumerate(returns)]
+        write_run([-9], seed=seed, evaluations={"mine": table, "episodes/mine": episodes})
+    found = find_readable_runs([tmp_path])
+    assert [len(run.evaluations.get("mine", ())) for run in found.runs] == [1, 0, 0]
+    assert len(found.errors) == 2
+    for run, error in zip(found.runs[1:], found.errors, strict=True):
+        assert str(error).startswith(f"{run.path / 'evaluations/episodes/mine.csv'} is not of ")

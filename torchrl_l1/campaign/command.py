@@ -48,9 +48,22 @@ def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> N
         raise OSError(
             f"{output} leads to itself through symbolic links: choose a folder"
         ) from error
+    if "${" in str(output):
+        raise CampaignError(
+            f"{output}: ${{ in a path stands for a setting in the settings of its runs; choose "
+            "another --output"
+        )
     _check_owner(output, campaign)
     # Runs that are reused need no device, so devices are checked once these are known.
     runs = plan(campaign, output, trusted=options.trust)
+    begun = [run for run in runs if run.directory.config_file.exists()]
+    changed = {n for run in begun for n in run.directory.changed_files(run.settings(), data=True)}
+    for name in sorted(changed):
+        print(
+            f"{name} has changed since runs in {output} began, which stay as they are; with "
+            "another --output all are trained anew",
+            file=sys.stderr,
+        )
     reused = find_reusable(runs, output, [Path(folder) for folder in options.reuse])
     if not (options.launcher and elsewhere(options.launcher)):
         check_devices(campaign, [run for run in runs if run.directory.path not in reused])

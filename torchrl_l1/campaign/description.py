@@ -54,6 +54,21 @@ _FLOAT_WORDS = re.compile(
 _Loader.add_implicit_resolver(_FLOAT, _FLOAT_WORDS, list("-+.0123456789"))
 
 
+def _integer(loader: _Loader, node: yaml.ScalarNode) -> int:
+    value = int(loader.construct_yaml_int(node))
+    if re.match(r"[-+]?0[0-9_]", node.value) or ":" in node.value:
+        raise yaml.constructor.ConstructorError(
+            None,
+            None,
+            f"{node.value} means {value} in YAML; write {value}, or '{node.value}' for the word",
+            node.start_mark,
+        )
+    return value
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _integer)
+
+
 class _Dumper(yaml.SafeDumper):
     """Quotes the words that either kind of loader would take for something else."""
 

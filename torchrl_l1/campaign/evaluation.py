@@ -13,6 +13,7 @@ from torchrl_l1.experiment.evaluate import (
     evaluate_episodes,
     load_run,
     reachable,
+    table_checksums,
 )
 from torchrl_l1.experiment.files import refuse_link, write_atomically, write_table
 from torchrl_l1.experiment.matrix import suite
@@ -29,7 +30,7 @@ def evaluation_file(run_dir: Path, name: str) -> Path:
 
 
 def is_evaluated(directory: RunDirectory, settings: EvaluationSettings) -> bool:
-    """Whether the table is there, made with these settings after the last iteration.
+    """Whether the table is there as it was written, made with these settings after all iterations.
 
     Settings that its description does not mention, since it is older than they are, have their
     defaults.
@@ -38,7 +39,10 @@ def is_evaluated(directory: RunDirectory, settings: EvaluationSettings) -> bool:
     try:
         before = load_yaml(table.with_suffix(".yaml"))
         iterations, cells = before.pop("iterations"), before.pop("disturbances", None)
+        checksums = before.pop("checksums", None)
         made_with = EvaluationSettings.from_keys(name=settings.name, **before)
+        if checksums not in (None, table_checksums(table)):
+            return False
     except (OSError, ValueError, AttributeError, KeyError, TypeError):
         return False
     now = _described(settings, directory.iterations_done())
@@ -94,5 +98,6 @@ def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
     write_table(table, rows)
     # Before its settings: what a kill comes between is made, and logged, again.
     log_evaluation(trained.recipe, trained.path, Evaluated(f"evaluations/{name}", rows))
-    write_atomically(described, dump_yaml(_described(chosen, trained.algorithm.iteration)))
+    words = _described(chosen, trained.algorithm.iteration)
+    write_atomically(described, dump_yaml({**words, "checksums": table_checksums(table)}))
     return table

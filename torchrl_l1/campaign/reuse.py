@@ -15,12 +15,8 @@ from torchrl_l1.campaign.plan import PlannedRun
 from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.evaluate import episodes_file
 from torchrl_l1.experiment.files import write_atomically
-from torchrl_l1.experiment.run_directory import (
-    RunDirectory,
-    differences,
-    read_config,
-    run_directories,
-)
+from torchrl_l1.experiment.run_directory import RunDirectory, read_config, run_directories
+from torchrl_l1.experiment.settings import differences
 from torchrl_l1.experiment.wandb_files import ID_FILE, draw_id, known_id
 
 
@@ -56,7 +52,12 @@ def find_reusable(
     for run in runs if finished else ():
         if run.directory.free() and not run.directory.held():
             now = run.settings()
-            same = [path for path, was in finished.get(_key(now), []) if not differences(was, now)]
+            same = [
+                path
+                for path, was in finished.get(_key(now), [])
+                if not differences(was, now)
+                and not RunDirectory(path).changed_files(now, data=True)
+            ]
             if same:
                 reused[run.directory.path] = same[0]
     return reused

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -16,6 +17,9 @@ DESCRIPTION = "Robust model-based reinforcement learning with L1 adaptive contro
 
 _TRUST = "let the file set up Hydra itself, which may run any code"
 
+
+# Values, and no options: of -1e-3 and -inf Python before 3.14 would say that there are none.
+_NEGATIVE = re.compile(r"-(?:\.?\d|inf\b|nan\b)", re.IGNORECASE)
 
 _LATER = (
     (
@@ -84,6 +88,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         help="write a copy to edit: of a recipe or campaign, to NAME.yaml or a file of your choice",
     )
 
+    for part in commands.choices.values():
+        part._negative_number_matcher = _NEGATIVE
     try:
         options, rest = parser.parse_known_args(arguments)
     except SystemExit:

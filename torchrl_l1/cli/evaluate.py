@@ -42,8 +42,7 @@ from torchrl_l1.experiment.matrix import (
     conditions,
 )
 from torchrl_l1.experiment.recipes import group_setting
-from torchrl_l1.experiment.run_directory import same_code_in
-from torchrl_l1.experiment.settings import RunSettings, WandbSettings
+from torchrl_l1.experiment.settings import RunSettings, WandbSettings, same_code_in
 from torchrl_l1.experiment.tracking import Evaluated, log_evaluation
 from torchrl_l1.report.evaluation_figures import RANGES, plot_disturbances
 from torchrl_l1.report.evaluation_summary import summarize, summary_tables
@@ -51,6 +50,30 @@ from torchrl_l1.report.recovery import MEDIANS, SHARES, is_about_robustness, plo
 
 _SECONDS_SHOWN = 4.0
 _COLUMNS = 10
+
+
+# What an evaluation may leave beside its tables.
+_PICTURES = ("robustness.png", "returns.png", "recovered.png", "filmstrip.png", "rollout.gif")
+
+
+class _Given(list[Any]):
+    """Values that were given, and are no default."""
+
+
+class Gathered(argparse.Action):
+    """Values of an option, also where it stands several times: none takes another's place."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """Add values to those that were given before."""
+        before = getattr(namespace, self.dest)
+        given = before if isinstance(before, _Given) else []
+        setattr(namespace, self.dest, _Given([*given, *values]))
 
 
 class _Suite(argparse.Action):
@@ -90,6 +113,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         where.add_argument(
             f"--{axis.name}",
             nargs="+",
+            action=Gathered,
             type=axis.kind,
             default=list(axis.values),
             choices=axis.choices or None,
@@ -281,6 +305,8 @@ def evaluate_command(options: argparse.Namespace) -> None:
                 progress.update()
 
     summary = summarize(rows, episodes)
+    for name in _PICTURES:  # those of an evaluation before are not of these tables
+        (output / name).unlink(missing_ok=True)
     # Before anything is printed: what reads the output may have ended long ago.
     tables = {"evaluation": rows, "episodes": episodes, "summary": summary}
     for name, table in tables.items():

@@ -6,6 +6,8 @@ import argparse
 import shlex
 from pathlib import Path
 
+from torchrl_l1.checks import check_count, check_positive
+from torchrl_l1.cli.evaluate import Gathered
 from torchrl_l1.envs import AnyTask, ExternalTask, get_task
 from torchrl_l1.envs.references import folders_of
 from torchrl_l1.experiment.files import write_atomically
@@ -30,7 +32,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--algorithm", choices=ALGORITHMS, default=ALGORITHMS[0], help="what shall learn")
     add("--dt", type=float, help="seconds of a step, where the environment does not tell")
     add("--horizon", type=int, help="steps of an episode, where the environment does not tell")
-    add("--observation-keys", nargs="+", default=[], help="parts that make the observation")
+    add(
+        "--observation-keys",
+        nargs="+",
+        action=Gathered,
+        default=[],
+        help="parts that make the observation",
+    )
 
 
 def new_task_command(options: argparse.Namespace) -> None:
@@ -40,6 +48,10 @@ def new_task_command(options: argparse.Namespace) -> None:
         raise ValueError(f"{file} must end in .yaml")
     if file.exists():
         raise ValueError(f"{file} exists already; choose another name")
+    if options.dt is not None:
+        check_positive("--dt", options.dt)
+    if options.horizon is not None:
+        check_count("--horizon", options.horizon)
     folders = folders_of([options.source], [file.parent, Path.cwd()])
     task = get_task(
         options.source,
@@ -72,7 +84,7 @@ def recipe_text(options: argparse.Namespace, task: AnyTask) -> str:
         "",
         f"recipe: {yaml_word(Path(options.file).stem)}",
         f"task: {yaml_word(options.source)}",
-        f"dt: {options.dt:g}  # seconds of a step" if options.dt else "# dt: the environment tells",
+        f"dt: {options.dt!r}  # seconds of a step" if options.dt else "# dt: the environment tells",
         f"horizon: {options.horizon}  # steps of an episode"
         if options.horizon
         else f"# horizon: {task.horizon}  # fewer steps make shorter episodes",

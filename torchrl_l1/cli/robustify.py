@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,14 @@ from typing import Any
 import wandb
 
 from torchrl_l1.checks import check_count
+from torchrl_l1.cli.evaluate import Gathered
 from torchrl_l1.deployment import Assessment, RobustController, robustify
 from torchrl_l1.deployment.robust_controller import PRESETS
-from torchrl_l1.envs import DISTURBANCES, SUITES
+from torchrl_l1.envs import DISTURBANCES, SUITES, environment_source
 from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.files import bounded, make_folder, write_atomically, write_table
+from torchrl_l1.experiment.matrix import check_disturbance
 from torchrl_l1.experiment.tracking import (
     MODES,
     Evaluated,
@@ -59,7 +62,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--suite", choices=SUITES, help="all disturbances, each at a few values")
     for name, entry in DISTURBANCES.items():
-        group.add_argument(f"--{name}", nargs="+", type=float, default=[], help=entry.help)
+        group.add_argument(
+            f"--{name}", nargs="+", action=Gathered, type=float, default=[], help=entry.help
+        )
     add("--episodes", type=int, default=10, help="episodes per cell")
     add("--most-steps", type=int, default=1000, help="after which an episode is cut off")
     add("--seed", type=int, default=0, help="of data, weights and resets")
@@ -76,6 +81,7 @@ def robustify_command(options: argparse.Namespace) -> None:
         raise ValueError(f"give --suite or --{next(iter(disturbances))}, not both")
     disturbances = options.suite or disturbances
     check_wandb_mode(options.wandb)
+    _check_disturbances(options.env, {} if options.suite else disturbances or {})
     check_count("episodes", options.episodes)
     check_count("most_steps", options.most_steps)
     output = Path(options.output or Path("runs/robustify", _folder(options.env)))
@@ -114,6 +120,16 @@ def robustify_command(options: argparse.Namespace) -> None:
     print(f"Table: {output / 'evaluation.csv'}, {output / 'episodes.csv'}")
     print(f"Chart: {chart}\nPage: {output / 'README.md'}\nController: {folder}\n")
     print(f"To use it:\n\n{usage}")
+
+
+def _check_disturbances(env: str, disturbances: Mapping[str, Sequence[float]]) -> None:
+    """Refuse what cannot be tested before data are collected and a model is fitted."""
+    for name, values in disturbances.items():
+        for value in values:
+            check_disturbance(name, value, prefix="--")
+    plant = {n: v[0] for n, v in disturbances.items() if DISTURBANCES[n].acts_on == "plant"}
+    if plant:
+        environment_source(env).several(1, plant).close()
 
 
 def _folder(env: str) -> str:

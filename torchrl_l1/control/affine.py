@@ -323,7 +323,8 @@ def _prepared(
     u_rl: Tensor,
 ) -> Step:
     """The step of a model that has been looked at: at the first one it is."""
-    if model.ready or torch.compiler.is_compiling():
+    nothing_to_see = observation.shape[:-1].numel() == 0
+    if model.ready or nothing_to_see or torch.compiler.is_compiling():
         return step(state, observation, u_rl)
     with FORWARD_MODE:  # where the step is compiled, torch differentiates while it traces
         model.prepare(observation, saturate(config, u_rl))

@@ -169,7 +169,8 @@ class ActionJacobian:
         One plain call gives lazy layers their weights; then what L1 asks of a model is tried on
         these data: a finite prediction of the right type and shape, the same at each call and
         whatever the other rows of the batch are, with a derivative. No global random number is
-        drawn. A model that is :attr:`ready` is left alone.
+        drawn. A model that is :attr:`ready` is left alone; of a batch without rows nothing can be
+        told, so the next one is looked at.
 
         Args:
             observation: ``(..., n)`` of a first step.
@@ -181,7 +182,7 @@ class ActionJacobian:
             RuntimeError: if it cannot be differentiated.
         """
         with FORWARD_MODE:
-            if self.ready:
+            if self.ready or observation.shape[:-1].numel() == 0:
                 return
             training = getattr(self.dynamics, "training", None)
             modes: dict[Mode, Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]]

@@ -127,7 +127,7 @@ def export(
         format: ``"torchscript"``, ``"onnx"`` or ``"export"``, if the suffix does not say.
         preset: settings of L1; those that act by default if ``None``.
         with_policy: without it, the policy's action is a second input ``u_rl (1, m)``.
-        steps: of the environment, on which it is compared.
+        steps: of the environment, on which it is compared at most; an episode may end before.
         tolerance: largest difference allowed, as a fraction of half the range of the action.
         seed: of those steps.
 
@@ -146,6 +146,7 @@ def export(
         for name in ("onnx", "onnxscript", "onnxruntime"):
             require(name, "onnx")
     config, recorded = _recorded(robust, preset, steps, seed)
+    steps = len(recorded)  # the episode may end before
     policy = robust.policy if with_policy else None
     module = ControlledStep(policy, robust.model, config).eval()
     names = list(module.fresh)

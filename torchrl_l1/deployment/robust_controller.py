@@ -360,6 +360,8 @@ def robustify(
     check_not_negative("noise", noise)
     if dt is not None:
         check_positive("dt", dt)
+    if epsilon is not None:
+        check_not_negative("epsilon", epsilon)
     with _private_randomness():  # environments may draw a seed as they are made
         source = _source(make_env, policy)
         dt = agreed_time_step(source, dt)

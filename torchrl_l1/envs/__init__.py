@@ -32,7 +32,13 @@ from torchrl_l1.envs.perturbations import (
     suite,
 )
 from torchrl_l1.envs.plant import disturbed_model, wind_force
-from torchrl_l1.envs.references import load_attribute, load_module, same_code
+from torchrl_l1.envs.references import (
+    code_digests,
+    file_digest,
+    load_attribute,
+    load_module,
+    same_code,
+)
 from torchrl_l1.envs.sensors import SensorBias, SensorDelay, SensorDropout
 from torchrl_l1.envs.simulation import BatchedSimulator, StartStates, TaskSimulation
 from torchrl_l1.envs.sources import EnvironmentSource, environment_source, vector_environment
@@ -76,9 +82,11 @@ __all__ = [
     "Uniform",
     "WalkBias",
     "action_bounds",
+    "code_digests",
     "disturbance_transforms",
     "disturbed_model",
     "environment_source",
+    "file_digest",
     "get_task",
     "gymnasium_id",
     "load_attribute",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -126,6 +127,33 @@ def same_code(names: Iterable[str], one: Sequence[str | Path], other: Sequence[s
         if None not in found and len({file.read_bytes() for file in found if file}) > 1:
             return False
     return True
+
+
+def code_digests(names: Iterable[str], folders: Sequence[str | Path]) -> dict[str, str]:
+    """Digests of the files and modules that names begin with, as far as they can be found.
+
+    Args:
+        names: such as ``envs.py:make_env`` or ``my_package:MyEnv-v0``.
+        folders: where to look; after them, the working directory.
+    """
+    found = {}
+    for module in dict.fromkeys(name.rpartition(":")[0] for name in names):
+        file = _file_of(module, (*folders, Path.cwd()))
+        if file is not None:
+            found[module] = file_digest(file)
+    return found
+
+
+def file_digest(file: Path) -> str:
+    """The first digits of a file's SHA-256; it is read again where its time or size is another."""
+    about = file.stat()
+    return _digest(file.resolve(), about.st_mtime_ns, about.st_size)
+
+
+@cache
+def _digest(file: Path, changed: int, size: int) -> str:
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()[:16]
 
 
 def _file_of(module: str, folders: Sequence[str | Path]) -> Path | None:

@@ -60,7 +60,16 @@ class BatchedSimulator:
         self._start()
 
     def _start(self) -> None:
-        self.batch = Batch(self.model, self.num_envs, nthread=self.threads)
+        try:
+            self.batch = Batch(self.model, self.num_envs, nthread=self.threads)
+        # As MuJoCo says it, by their number.
+        except (MemoryError, TypeError, ValueError) as error:
+            if isinstance(error, TypeError) and self.num_envs < 2**31:
+                raise
+            raise ValueError(
+                f"{self.num_envs} environments at a time do not fit into the memory of this "
+                "machine: ask for fewer episodes"
+            ) from error
         self.qpos: np.ndarray = self.batch.bind("qpos")
         self.qvel: np.ndarray = self.batch.bind("qvel")
         self._ctrl: np.ndarray = self.batch.bind("ctrl")

@@ -6,7 +6,8 @@ import math
 import pickle
 import warnings
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,17 @@ class CheckpointSettings:
 
     every: int | None = None
     best: bool = False
+
+
+@contextmanager
+def single_precision() -> Iterator[None]:
+    """Torch's default type as runs have it, whichever a session has chosen before and after."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
 
 
 _ENTRIES = {"algorithm": dict, "metrics": list, "timings": list}

@@ -38,7 +38,7 @@ def fitting_into_memory(what: str) -> Iterator[None]:
             raise
         raise ValueError(
             f"{what} does not fit into the memory of this machine; look at the sizes of its "
-            "networks and data (model.hidden, model.members, policy.hidden, horizon)"
+            "networks and data (model.hidden, model.members, policy.hidden, horizon, episodes)"
         ) from error
 
 

@@ -27,8 +27,9 @@ from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import calibrate_filter
 from torchrl_l1.dynamics.validation import one_step_residuals
 from torchrl_l1.envs import DISTURBANCES, AnyTask, ExternalTask, Perturbation
-from torchrl_l1.experiment.checkpoints import KEPT, kept_by, load_state
+from torchrl_l1.experiment.checkpoints import KEPT, kept_by, load_state, single_precision
 from torchrl_l1.experiment.errors import RunDirectoryError, fitting_into_memory, message
+from torchrl_l1.experiment.files import digest, read_text
 from torchrl_l1.experiment.l1_options import (
     closest_option,
     l1_option,
@@ -106,11 +107,12 @@ def load_run(path: str | Path, *, last: bool = False) -> TrainedRun:
     here: dict[str, Any] = {"device": "cpu"}
     if hasattr(recipe, "compile_plans"):
         here["compile_plans"] = False  # as "auto" decides on the CPU
-    with fitting_into_memory(str(path)):
+    with fitting_into_memory(str(path)), single_precision():
         algorithm = replace(recipe, **here).build()
     state = checkpoint["algorithm"]
-    load_state(algorithm, {**state, "buffer": {}}, directory.checkpoint_file)
-    _measure_residuals(algorithm, state.get("buffer", {}), recipe)
+    with single_precision():
+        load_state(algorithm, {**state, "buffer": {}}, directory.checkpoint_file)
+        _measure_residuals(algorithm, state.get("buffer", {}), recipe)
     return TrainedRun(directory.path, recipe, algorithm, Path(path).stem if kept else "")
 
 
@@ -211,8 +213,9 @@ def evaluate_episodes(
     check_plants(trained.algorithm.task, cells)
     check_controllers(trained.recipe.l1, trained.algorithm.task, cells)
     for cell in [replace(cell, stage=trained.stage(cell.stage)) for cell in cells]:
-        collection = make_collection(trained, cell, episodes)
-        data = collection.evaluate(seed, deterministic=cell.policy == "deterministic")
+        with fitting_into_memory(f"an evaluation of {episodes} episodes"), single_precision():
+            collection = make_collection(trained, cell, episodes)
+            data = collection.evaluate(seed, deterministic=cell.policy == "deterministic")
         place = {
             "run": trained.name,
             "training_seed": trained.recipe.seed,
@@ -279,6 +282,17 @@ def reachable(task: AnyTask, cells: Sequence[Condition]) -> list[Condition]:
 def episodes_file(table: Path) -> Path:
     """Where the rows of single episodes are that belong to a table in ``RUN_DIR/evaluations``."""
     return table.parent / "episodes" / table.name
+
+
+def table_checksums(table: Path) -> dict[str, str]:
+    """Digests of a table in ``RUN_DIR/evaluations`` and of its episodes, as far as they are there.
+
+    Raises:
+        OSError: if one cannot be read.
+        ValueError: if one is no text.
+    """
+    files = {"table": table, "episodes": episodes_file(table)}
+    return {name: digest(read_text(file)) for name, file in files.items() if file.exists()}
 
 
 def make_collection(trained: TrainedRun, cell: Condition, episodes: int) -> Collection:

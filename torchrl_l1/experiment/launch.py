@@ -90,9 +90,9 @@ def launch(name: str, arguments: Sequence[str]) -> None:
     register()
     flags, overrides = split_flags([text for text in arguments if text != "--trust"])
     if not any(flag.partition("=")[0] in _OWN_WAYS for flag in flags):
-        config = _check(
-            recipe, overrides, "-m" in flags or "--multirun" in flags, "--trust" in arguments
-        )
+        sweeps = "-m" in flags or "--multirun" in flags
+        overrides = _spelled_out(recipe, overrides) if sweeps else overrides
+        config = _check(recipe, overrides, sweeps, "--trust" in arguments)
         overrides += _search_path_override(recipe, config, overrides)
     before = sys.argv
     settings = [*_search_path(recipe), *_HYDRA_SETTINGS]
@@ -126,6 +126,7 @@ def _check(recipe: Path, overrides: Sequence[str], sweeps: bool, trusted: bool) 
     if not trusted:
         check_data(recipe)
     settings = [*_search_path(recipe), *_HYDRA_SETTINGS]
+    _check_options(recipe, overrides)
     try:
         with _composing(recipe.parent):
             first = _first(overrides) if sweeps else list(overrides)
@@ -166,6 +167,26 @@ def _composed(name: str | None, overrides: list[str]) -> DictConfig:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Hydra says it again when it runs
         return application.compose_config(name, overrides, run_mode=RunMode.RUN, from_shell=False)
+
+
+def _spelled_out(recipe: Path, overrides: Sequence[str]) -> list[str]:
+    """Overrides with the options that a glob matches: Hydra knows those beside the recipe only."""
+    folders = [recipe.parent, shared_dir(), *_folders(recipe)]
+    found = []
+    for text in overrides:
+        key, _, value = text.partition("=")
+        if value.startswith("glob("):
+            try:
+                pattern: Any = OverridesParser.create().parse_overrides([text])[0].value()
+            except HydraException as error:
+                raise RecipeError(message(error)) from error
+            files = (file for folder in folders for file in (folder / key).glob("*.yaml"))
+            options = pattern.filter(sorted({file.stem for file in files}))
+            if not options:
+                raise RecipeError(f"{text} matches nothing, so there is nothing to run")
+            text = f"{key}={','.join(options)}"
+        found.append(text)
+    return found
 
 
 def _first(overrides: Sequence[str]) -> list[str]:
@@ -281,6 +302,7 @@ def compose(name: str, overrides: Sequence[str] = (), *, trusted: bool = False) 
     register()
     if not trusted:
         check_data(recipe)
+    _check_options(recipe, overrides)
     with _composing(recipe.parent):
         own = [*overrides, *_name(recipe, overrides)]
         config = hydra.compose(recipe.stem, [*_search_path(recipe), *own])
@@ -326,9 +348,33 @@ def _folders_of_code(recipe: Path, config: DictConfig, overrides: Sequence[str])
 def _search_path(recipe: Path) -> list[str]:
     """Where Hydra looks beside the recipe: with its algorithm, in ``shared``, and from the root."""
     folders = [shared_dir(), *_folders(recipe), recipes_dir()]
+    for name, algorithm in _SCHEMA_NAMES.items():
+        own = recipe.parent / f"{name}.yaml"
+        if recipes_dir() / algorithm in folders and own.is_file():
+            raise RecipeError(
+                f"{own} is called like the schema {name}, which recipes beside it would not find; "
+                "rename the file"
+            )
     unique = dict.fromkeys(folder for folder in folders if folder != recipe.parent)
     quoted = ",".join(f"'file://{folder}'" for folder in unique)
     return [f"hydra.searchpath=[{quoted}]"]
+
+
+def _check_options(recipe: Path, overrides: Sequence[str]) -> None:
+    """Refuse several options of a group in one run: the last one would count, and none is told."""
+    folders = [recipe.parent, shared_dir(), *_folders(recipe)]
+    for text in overrides:
+        key, _, value = text.lstrip("+").partition("=")
+        several = value.strip().removeprefix("[").removesuffix("]")
+        if (
+            value.strip().startswith("[")
+            and key
+            and any((folder / key).is_dir() for folder in folders)
+        ):
+            raise RecipeError(
+                f"{text}: a run has one {key}; -m {key}={several.replace(' ', '')} makes a run of "
+                "each, and so does a campaign's matrix"
+            )
 
 
 def _folders(recipe: Path) -> list[Path]:

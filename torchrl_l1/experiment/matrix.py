@@ -249,6 +249,25 @@ def disturbance_words(columns: Mapping[str, Any]) -> str:
     return ", ".join(found) or "undisturbed"
 
 
+def check_disturbance(name: str, value: float, prefix: str = "") -> None:
+    """Refuse a value that a disturbance cannot have.
+
+    Args:
+        name: of the disturbance.
+        value: what it is to be.
+        prefix: what stands before its name where the user writes it.
+
+    Raises:
+        ValueError: naming disturbance and value.
+    """
+    if not math.isfinite(value):
+        raise ValueError(f"{prefix}{name} must be finite, got {value}")
+    try:
+        DISTURBANCES[name].check(value)
+    except ValueError as error:
+        raise ValueError(f"{prefix}{name}: {error}") from None
+
+
 def check_values(values: Mapping[str, Sequence[Any]], prefix: str = "") -> None:
     """Refuse values that nothing can be tested with.
 
@@ -266,12 +285,7 @@ def check_values(values: Mapping[str, Sequence[Any]], prefix: str = "") -> None:
                     f"unknown {axis.name} {value!r}; there are {', '.join(axis.choices)}"
                 )
             if axis.name in DISTURBANCES:
-                if not math.isfinite(value):
-                    raise ValueError(f"{prefix}{axis.name} must be finite, got {value}")
-                try:
-                    DISTURBANCES[axis.name].check(value)
-                except ValueError as error:
-                    raise ValueError(f"{prefix}{axis.name}: {error}") from None
+                check_disturbance(axis.name, value, prefix)
     check_tuning(values["epsilon"], values["alpha"], prefix)
 
 

@@ -15,7 +15,12 @@ from tqdm import tqdm
 
 from torchrl_l1.algorithms import Algorithm
 from torchrl_l1.algorithms.algorithm import Diverged, IterationResult
-from torchrl_l1.experiment.checkpoints import checkpoint_of, keep_checkpoints, load_state
+from torchrl_l1.experiment.checkpoints import (
+    checkpoint_of,
+    keep_checkpoints,
+    load_state,
+    single_precision,
+)
 from torchrl_l1.experiment.errors import RunDirectoryError, fitting_into_memory
 from torchrl_l1.experiment.files import refuse_link, write_atomically
 from torchrl_l1.experiment.run_directory import RunDirectory, read_config, versions
@@ -52,7 +57,7 @@ def run(config: DictConfig) -> Path:
         unit="iteration",
         disable=None,
     )
-    with progress:
+    with progress, single_precision():
         with fitting_into_memory(recipe.recipe):
             algorithm = recipe.build()
         algorithm.on_phase = lambda phase: progress.set_postfix_str(phase)
@@ -61,7 +66,7 @@ def run(config: DictConfig) -> Path:
             refuse_link(directory.path / folder)
         if not (recipe.resume and directory.checkpoint_file.exists()):
             algorithm.prepare()
-        with directory.open(settings, recipe.resume):
+        with directory.open(settings, recipe.resume), fitting_into_memory(recipe.recipe):
             _run(algorithm, recipe, settings, directory, progress)
     print(f"Finished: {directory.metrics_file}")
     return directory.path

@@ -19,7 +19,7 @@ import yaml  # type: ignore[import-untyped]
 from omegaconf import OmegaConf
 
 import torchrl_l1
-from torchrl_l1.envs import same_code
+from torchrl_l1.envs import file_digest
 from torchrl_l1.experiment.checkpoints import read_checkpoint
 from torchrl_l1.experiment.errors import RunDirectoryError, RunDirectoryInUse, message
 from torchrl_l1.experiment.files import (
@@ -32,7 +32,7 @@ from torchrl_l1.experiment.files import (
     table_text,
     write_atomically,
 )
-from torchrl_l1.experiment.settings import NAMING_KEYS, VOLATILE_KEYS, flatten, schema_defaults
+from torchrl_l1.experiment.settings import MAY_GROW, code_versions, differences
 
 PACKAGES = ("torch", "tensordict", "torchrl", "gymnasium", "mujoco", "numpy")
 
@@ -95,9 +95,8 @@ def _output(command: list[str]) -> str:
 # What a run killed in its first moments may leave behind; its directory is still free.
 _BEFORE_CONFIG = (".lock", "versions.json", "versions.json.tmp", "config.yaml.tmp")
 
-# A run that is asked for more iterations than it had continues; no other setting may change.
-_MAY_GROW = "outer_iterations"
-
+# Settings that a run may go on with and that count for what is done with it later.
+_RENEWED = (MAY_GROW, "search_path")
 
 # Files whose checksums are kept; the tables' by their number of rows.
 _TABLES, _WEIGHTS = ("metrics.csv", "timing.csv"), ("model.pt", "policy.pt")
@@ -120,6 +119,7 @@ class RunDirectory:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.config_file = self.path / "config.yaml"
+        self.versions_file = self.path / "versions.json"
         self.checkpoint_file = self.path / "checkpoint.pt"
         self.previous_file = self.path / "checkpoint_previous.pt"
         self.metrics_file = self.path / "metrics.csv"
@@ -154,8 +154,11 @@ class RunDirectory:
             if not ours:
                 raise RunDirectoryInUse(f"another process is running in {self.path}")
             if not self.config_file.exists():
-                write_atomically(self.path / "versions.json", json.dumps(versions(), indent=2))
-            if self._stored().get(_MAY_GROW) != config.get(_MAY_GROW) or not resume:
+                found = {**versions(), **code_versions(config), **_data_version(config)}
+                write_atomically(self.versions_file, json.dumps(found, indent=2))
+            stored = self._stored()
+            # Folders of the user's code may have moved; what evaluates the run looks there, too.
+            if not resume or any((stored.get(k) or []) != (config.get(k) or []) for k in _RENEWED):
                 write_atomically(self.config_file, OmegaConf.to_yaml(OmegaConf.create(config)))
             yield
 
@@ -293,6 +296,8 @@ class RunDirectory:
         if state is not None and problems:
             done = len(state["metrics"])
             say(f"{problems[0]}; {self.previous_file.name} is used, of {done} iterations")
+        for name in self.changed_files(config or self._stored()) if state is not None else ():
+            say(f"{name} is not as it was when the run in {self.path} began; it is used as it is")
         if state is None and self._has_results():
             raise RunDirectoryError(
                 f"{'; '.join(problems)}; but there are results, which are left as they are: choose "
@@ -301,6 +306,21 @@ class RunDirectory:
         if state is None and self.checkpoint_file.exists():
             say(f"{problems[0]}; the run starts over")
         return state
+
+    def changed_files(self, config: Mapping[str, Any], data: bool = False) -> list[str]:
+        """Files of the user's that ``config`` names and that have changed since the run began.
+
+        Args:
+            config: of the run.
+            data: whether the dataset is one of them; a run that goes on has its data already.
+        """
+        try:
+            began = json.loads(read_text(self.versions_file))
+        except (OSError, ValueError, RecursionError):
+            return []
+        known = began if isinstance(began, dict) else {}
+        found = {**code_versions(config), **(_data_version(config) if data else {})}
+        return [name for name, version in found.items() if known.get(name, version) != version]
 
     def load_kept(self, file: Path) -> dict[str, Any]:
         """A checkpoint that the run has kept.
@@ -405,53 +425,16 @@ class RunDirectory:
         }
 
 
+def _data_version(config: Mapping[str, Any]) -> dict[str, str]:
+    """The digest of the dataset that an offline run names, where it is a file."""
+    file = Path(str(config.get("dataset") or ""))
+    return {str(config["dataset"]): f"sha256 {file_digest(file)}"} if file.is_file() else {}
+
+
 def _shortened(items: Sequence[str], most: int = 8) -> str:
     """A list in one line."""
     rest = f"; and {len(items) - most} more" if len(items) > most else ""
     return "; ".join(items[:most]) + rest
-
-
-def differences(
-    before: Mapping[str, Any], now: Mapping[str, Any], may_grow: bool = False
-) -> list[str]:
-    """The settings that differ between two runs and touch the result, a text for each.
-
-    Settings that the first run does not mention, since it is older than they are, have the
-    schema's defaults.
-
-    Args:
-        before: configuration of the first run.
-        now: configuration of the second.
-        may_grow: whether the second may have more outer iterations.
-
-    Examples:
-        >>> before = {"seed": 0, "outer_iterations": 2, "run_dir": "here"}
-        >>> now = {"seed": 1, "outer_iterations": 3, "run_dir": "there"}
-        >>> differences(before, now)
-        ['outer_iterations: 2 there, 3 now', 'seed: 0 there, 1 now']
-        >>> differences(before, now, may_grow=True)
-        ['seed: 0 there, 1 now']
-    """
-    defaults = schema_defaults(now)
-    other_code = [] if same_code_in(before, now) else ["search_path"]
-    before, now = flatten(before), flatten(now)
-    before = {k: v for k, v in defaults.items() if k in now} | before
-    had, has = before.get(_MAY_GROW, 0), now.get(_MAY_GROW, 0)
-    # A damaged configuration may hold anything.
-    if may_grow and isinstance(had, int) and isinstance(has, int) and had < has:
-        before[_MAY_GROW] = has
-    return [
-        f"{key}: {before.get(key, '(absent)')} there, {now.get(key, '(absent)')} now"
-        for key in sorted(before.keys() | now.keys())
-        if key in other_code
-        or (before.get(key) != now.get(key) and key.split(".")[0] not in VOLATILE_KEYS)
-    ]
-
-
-def same_code_in(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Whether files and modules that settings name are the same in both; paths may differ."""
-    paths = [list(map(str, config.get("search_path") or ())) for config in (before, now)]
-    return same_code([str(now.get(key)) for key in NAMING_KEYS], *paths)
 
 
 def run_directories(folder: Path) -> Iterator[tuple[Path, dict[str, Any] | RunDirectoryError]]:

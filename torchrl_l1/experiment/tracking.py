@@ -24,10 +24,13 @@ from torchrl_l1.checks import check_choice
 from torchrl_l1.experiment.errors import RunDirectoryError, message
 from torchrl_l1.experiment.files import locked, refuse_link
 from torchrl_l1.experiment.run_directory import read_config
-from torchrl_l1.experiment.settings import RunSettings
+from torchrl_l1.experiment.settings import RunSettings, WandbSettings
 from torchrl_l1.experiment.wandb_files import has_ended, known_id, take_over
 
 MODES = ("auto", "online", "offline", "disabled")
+
+# What W&B takes from the environment, older words among it.
+_WANDB_MODES = ("online", "offline", "disabled", "shared", "run", "dryrun")
 
 LOGGERS = ("wandb", "tensorboard")
 """What a recipe's ``loggers`` may name."""
@@ -45,6 +48,11 @@ def check_wandb_mode(mode: str) -> None:
     """
     if mode not in MODES:
         raise ValueError(f"wandb.mode must be one of {', '.join(MODES)}, got {mode!r}")
+    here = os.environ.get("WANDB_MODE")
+    if mode == "auto" and here and here not in _WANDB_MODES:
+        raise ValueError(
+            f"WANDB_MODE={here}: it must be one of {', '.join(_WANDB_MODES)}; or set wandb.mode"
+        )
     if mode == "online" and not _has_key():
         raise ValueError(
             "wandb.mode=online needs an API key; log in with wandb login or set WANDB_API_KEY, or "
@@ -62,10 +70,23 @@ def check_loggers(recipe: RunSettings) -> None:
         check_choice("loggers", name, LOGGERS)
     if "wandb" in recipe.loggers:
         check_wandb_mode(recipe.wandb.mode)
+        _check_words(recipe.wandb)
     if "tensorboard" in recipe.loggers and find_spec("tensorboard") is None:
         raise ValueError(
             "loggers: tensorboard is not installed; pip install 'torchrl-l1[tensorboard]'"
         )
+
+
+def _check_words(settings: WandbSettings) -> None:
+    """Refuse names that W&B would refuse when the run has begun."""
+    for key, field in (("project", "project"), ("tags", "run_tags")):
+        given: dict[str, Any] = {field: getattr(settings, key)}
+        try:
+            wandb.Settings(**given)
+        except (ValueError, wandb.errors.Error) as error:
+            # Pydantic's has several lines, with an address.
+            why = error.errors()[0]["msg"] if hasattr(error, "errors") else error
+            raise ValueError(f"wandb.{key}: {why}") from error
 
 
 def chosen_mode(mode: str) -> str:

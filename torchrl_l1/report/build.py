@@ -195,7 +195,8 @@ def _read_campaign(folder: Path, runs: Sequence[Run]) -> CampaignState:
     content = load_yaml(file)
     try:
         name = str(content.get("name", folder.name))
-        matrices = [entry["matrix"] for entry in content["runs"]]
+        # Without a matrix it is one run, of seed 0.
+        matrices = [entry.get("matrix") or {} for entry in content["runs"]]
         expected = sum(math.prod(map(len, matrix.values())) for matrix in matrices)
     except (AttributeError, IndexError, KeyError, TypeError) as error:
         raise ValueError(f"{file} is no campaign file: {error!r}") from error
@@ -204,7 +205,7 @@ def _read_campaign(folder: Path, runs: Sequence[Run]) -> CampaignState:
         # The file in the folder has the overrides of its command; the shipped one has none.
         same = read_campaign(name).to_dict()["runs"] == content["runs"]
         given = name if same else file
-    mine = [run for run in runs if run.path.resolve().is_relative_to(folder.resolve())]
+    mine = [run for run in runs if _campaign_of(run.path.resolve()) == folder.resolve()]
     return CampaignState(
         name,
         str(content.get("description", "")),
@@ -213,6 +214,11 @@ def _read_campaign(folder: Path, runs: Sequence[Run]) -> CampaignState:
         sum(run.finished for run in mine),
         sum(not run.finished for run in mine),
     )
+
+
+def _campaign_of(run: Path) -> Path | None:
+    """The folder of the campaign that a run is of: the next above it with a ``campaign.yaml``."""
+    return next((above for above in run.parents if (above / "campaign.yaml").is_file()), None)
 
 
 def _one_line(command: str) -> str:

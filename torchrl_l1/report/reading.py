@@ -126,6 +126,13 @@ def read_evaluations(file: Path) -> list[Evaluation]:
         # The episodes of older tables may have no numbers.
         for row in _each_once(episodes, _condition_rows(episodes, ("return",), ("episode",))):
             singly.setdefault(_condition_key(row), []).append(row["return"])
+    for row in rows:
+        found = singly.get(_condition_key(row), [])
+        if found and not _is_mean(row, found):
+            raise RunDirectoryError(
+                f"{episodes} is not of {file}: its episodes of L1 {row['l1']} have another mean or "
+                "number than the table says; evaluate the run again"
+            )
     return [
         Evaluation(
             l1=row["l1"],
@@ -144,6 +151,13 @@ def read_evaluations(file: Path) -> list[Evaluation]:
         )
         for row in rows
     ]
+
+
+def _is_mean(row: Mapping[str, Any], returns: Sequence[float]) -> bool:
+    """Whether a row of a table is of these episodes; means were taken in single precision."""
+    size = max(map(abs, returns))
+    same = abs(float(np.mean(returns)) - row["return_mean"]) <= 1e-4 * size + 1e-9
+    return same and len(returns) == int(row["episodes"])
 
 
 def _each_once(file: Path, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -258,10 +272,12 @@ def numeric_rows(
     """
     try:
         reader = csv.reader(io.StringIO(read_text(file, _MOST_BYTES), newline=""), strict=True)
-        # The last of equal names counts.
         header = next(reader, [])
         columns = len(header)
         place = {name: index for index, name in enumerate(header)}
+        twice = [k for k in (*words, *numbers, *optional, *if_any) if header.count(k) > 1]
+        if twice:
+            raise ValueError(f"{file} has the column {', '.join(twice)} twice")
         missing = [k for k in (*words, *numbers) if k not in place]
         if missing:
             raise ValueError(f"{file} has no column {', '.join(missing)}")

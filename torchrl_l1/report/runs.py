@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 from torchrl_l1.algorithms.facts import MEASURING, WINDOW
 from torchrl_l1.campaign.description import load_yaml
 from torchrl_l1.experiment.errors import RunDirectoryError, message
+from torchrl_l1.experiment.evaluate import table_checksums
 from torchrl_l1.experiment.files import read_text
 from torchrl_l1.experiment.run_directory import RunDirectory, run_directories
 from torchrl_l1.report.identity import Identity, facts, identify
@@ -216,11 +218,17 @@ def _read_table(file: Path, iterations: int | None) -> list[Evaluation]:
     """
     if not re.fullmatch(r"[A-Za-z0-9_.+-]{1,100}", file.stem):
         raise RunDirectoryError(f"cannot use {file}: its name is no word of at most 100 letters")
-    described = file.with_suffix(".yaml")
-    try:
-        made_after = load_yaml(described)["iterations"] if described.exists() else iterations
-    except (OSError, ValueError, LookupError, TypeError):
-        made_after = iterations  # it is the table that counts
+    described, known, made_after = file.with_suffix(".yaml"), None, iterations
+    # Where it says nothing it is the table that counts.
+    with suppress(OSError, ValueError, LookupError, TypeError, AttributeError):
+        if described.exists():
+            content = load_yaml(described)
+            made_after, known = content["iterations"], content.get("checksums")
+    if isinstance(known, dict) and known != table_checksums(file):
+        raise RunDirectoryError(
+            f"{file} or the table of its episodes is not as it was written (see {described.name}); "
+            "its campaign makes it again"
+        )
     if isinstance(made_after, int) and iterations not in (None, made_after):
         raise RunDirectoryError(
             f"{file} was made after {made_after} iterations, and the run has {iterations}; its "
