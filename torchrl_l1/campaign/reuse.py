@@ -15,8 +15,8 @@ from torchrl_l1.campaign.plan import PlannedRun
 from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.evaluate import episodes_file
 from torchrl_l1.experiment.files import write_atomically
+from torchrl_l1.experiment.provenance import differences
 from torchrl_l1.experiment.run_directory import RunDirectory, read_config, run_directories
-from torchrl_l1.experiment.settings import differences
 from torchrl_l1.experiment.wandb_files import ID_FILE, draw_id, known_id
 
 

@@ -41,8 +41,9 @@ from torchrl_l1.experiment.matrix import (
     check_values,
     conditions,
 )
+from torchrl_l1.experiment.provenance import same_code_in
 from torchrl_l1.experiment.recipes import group_setting
-from torchrl_l1.experiment.settings import RunSettings, WandbSettings, same_code_in
+from torchrl_l1.experiment.settings import RunSettings, WandbSettings
 from torchrl_l1.experiment.tracking import Evaluated, log_evaluation
 from torchrl_l1.report.evaluation_figures import RANGES, plot_disturbances
 from torchrl_l1.report.evaluation_summary import summarize, summary_tables

@@ -23,7 +23,8 @@ from torchrl_l1.experiment.checkpoints import (
 )
 from torchrl_l1.experiment.errors import RunDirectoryError, fitting_into_memory
 from torchrl_l1.experiment.files import refuse_link, write_atomically
-from torchrl_l1.experiment.run_directory import RunDirectory, read_config, versions
+from torchrl_l1.experiment.provenance import versions
+from torchrl_l1.experiment.run_directory import RunDirectory, read_config
 from torchrl_l1.experiment.settings import RunSettings, check_known, schema_of
 from torchrl_l1.experiment.signals import RESUME_ME, asked_to_make_room
 from torchrl_l1.experiment.tracking import check_loggers, lacks, trackers

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-import platform
-import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +14,6 @@ import torch
 import yaml  # type: ignore[import-untyped]
 from omegaconf import OmegaConf
 
-import torchrl_l1
-from torchrl_l1.envs import file_digest
 from torchrl_l1.experiment.checkpoints import read_checkpoint
 from torchrl_l1.experiment.errors import RunDirectoryError, RunDirectoryInUse, message
 from torchrl_l1.experiment.files import (
@@ -32,65 +26,13 @@ from torchrl_l1.experiment.files import (
     table_text,
     write_atomically,
 )
-from torchrl_l1.experiment.settings import MAY_GROW, code_versions, differences
-
-PACKAGES = ("torch", "tensordict", "torchrl", "gymnasium", "mujoco", "numpy")
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python, the platform and the packages that a result depends on.
-
-    In a git checkout of this package the commit joins them, see :func:`commit`. They are looked up
-    once in a process, whose code stays what it was.
-    """
-    return dict(_versions())
-
-
-@cache
-def _versions() -> dict[str, str]:
-    found = {
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        # Not from the metadata of an installation: it may be that of another copy.
-        "torchrl-l1": torchrl_l1.__version__,
-    }
-    package = Path(torchrl_l1.__file__).parent
-    at = commit(package)
-    if at is not None:
-        found["torchrl-l1 commit"] = at
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
-
-
-def commit(package: Path) -> str | None:
-    """The commit of the git checkout that a package's folder lies at the top of.
-
-    Args:
-        package: the folder.
-
-    Returns:
-        its hash, followed by ``with changes`` where files of the package differ from it;
-        ``None`` where there is no checkout or no git.
-    """
-    if not (package.parent / ".git").exists():
-        return None
-    # Without locks: many runs may ask at once, and beside somebody's own git.
-    git = ["git", "--no-optional-locks", "-C", str(package.parent)]
-    try:
-        head = _output([*git, "rev-parse", "HEAD"])
-        changes = _output([*git, "status", "--porcelain", "--", package.name])
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return f"{head} with changes" if changes else head
-
-
-def _output(command: list[str]) -> str:
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
-
+from torchrl_l1.experiment.provenance import (
+    MAY_GROW,
+    code_versions,
+    data_version,
+    differences,
+    versions,
+)
 
 # What a run killed in its first moments may leave behind; its directory is still free.
 _BEFORE_CONFIG = (".lock", "versions.json", "versions.json.tmp", "config.yaml.tmp")
@@ -154,7 +96,7 @@ class RunDirectory:
             if not ours:
                 raise RunDirectoryInUse(f"another process is running in {self.path}")
             if not self.config_file.exists():
-                found = {**versions(), **code_versions(config), **_data_version(config)}
+                found = {**versions(), **code_versions(config), **data_version(config)}
                 write_atomically(self.versions_file, json.dumps(found, indent=2))
             stored = self._stored()
             # Folders of the user's code may have moved; what evaluates the run looks there, too.
@@ -319,7 +261,7 @@ class RunDirectory:
         except (OSError, ValueError, RecursionError):
             return []
         known = began if isinstance(began, dict) else {}
-        found = {**code_versions(config), **(_data_version(config) if data else {})}
+        found = {**code_versions(config), **(data_version(config) if data else {})}
         return [name for name, version in found.items() if known.get(name, version) != version]
 
     def load_kept(self, file: Path) -> dict[str, Any]:
@@ -423,12 +365,6 @@ class RunDirectory:
             self.checksums_file: json.dumps(checksums, indent=2).encode(),
             self.metrics_file: texts[self.metrics_file].encode(),
         }
-
-
-def _data_version(config: Mapping[str, Any]) -> dict[str, str]:
-    """The digest of the dataset that an offline run names, where it is a file."""
-    file = Path(str(config.get("dataset") or ""))
-    return {str(config["dataset"]): f"sha256 {file_digest(file)}"} if file.is_file() else {}
 
 
 def _shortened(items: Sequence[str], most: int = 8) -> str:

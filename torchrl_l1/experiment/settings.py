@@ -31,7 +31,7 @@ from torchrl_l1.algorithms.outcomes import check_outcome
 from torchrl_l1.checks import check_choice, check_count, check_optional_count, check_positive
 from torchrl_l1.compilation import check_mode
 from torchrl_l1.control import L1Config
-from torchrl_l1.envs import AnyTask, code_digests, get_task, same_code
+from torchrl_l1.envs import AnyTask, get_task
 from torchrl_l1.experiment.checkpoints import CheckpointSettings
 from torchrl_l1.experiment.datasets import read_dataset
 from torchrl_l1.experiment.files import bounded_overrides, path_text
@@ -248,23 +248,8 @@ VOLATILE_KEYS = (
     *("run_dir", "resume", "wandb", "on_divergence", "loggers", "checkpoint", "search_path"),
 )
 
-MAY_GROW = "outer_iterations"
-"""A run that is asked for more of them than it had continues; no other setting may change."""
-
 NAMING_KEYS = ("task", "reward", "termination")
 """Keys that may name code of the user's, which the search path is for."""
-
-
-def code_versions(config: Mapping[str, Any]) -> dict[str, str]:
-    """Digests of the user's files that settings name code of, such as ``sha256 12ab...``, by name.
-
-    Examples:
-        >>> code_versions({"task": "hopper", "reward": "builtin"})
-        {}
-    """
-    names = [str(config.get(key)) for key in NAMING_KEYS]
-    folders = [str(folder) for folder in config.get("search_path") or ()]
-    return {name: f"sha256 {code}" for name, code in code_digests(names, folders).items()}
 
 
 def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
@@ -447,50 +432,3 @@ def schema_defaults(config: Mapping[str, Any]) -> Mapping[str, Any]:
 def _defaults(algorithm: str) -> Mapping[str, Any]:
     node = OmegaConf.to_container(OmegaConf.structured(SCHEMAS[algorithm]))
     return {key: value for key, value in flatten(node).items() if value != MISSING}
-
-
-def differences(
-    before: Mapping[str, Any], now: Mapping[str, Any], may_grow: bool = False
-) -> list[str]:
-    """The settings that differ between two runs and touch the result, a text for each.
-
-    Settings that the first run does not mention, since it is older than they are, have the
-    schema's defaults.
-
-    Args:
-        before: configuration of the first run.
-        now: configuration of the second.
-        may_grow: whether the second may have more outer iterations.
-
-    Examples:
-        >>> before = {"seed": 0, "outer_iterations": 2, "run_dir": "here"}
-        >>> now = {"seed": 1, "outer_iterations": 3, "run_dir": "there"}
-        >>> differences(before, now)
-        ['outer_iterations: 2 there, 3 now', 'seed: 0 there, 1 now']
-        >>> differences(before, now, may_grow=True)
-        ['seed: 0 there, 1 now']
-    """
-    defaults = schema_defaults(now)
-    other_code = [] if same_code_in(before, now) else ["search_path"]
-    before, now = flatten(before), flatten(now)
-    # Either may be older than a setting: what is stored is not written anew by each version.
-    before, now = (
-        {k: v for k, v in defaults.items() if k in other} | own
-        for own, other in ((before, now), (now, before))
-    )
-    had, has = before.get(MAY_GROW, 0), now.get(MAY_GROW, 0)
-    # A damaged configuration may hold anything.
-    if may_grow and isinstance(had, int) and isinstance(has, int) and had < has:
-        before[MAY_GROW] = has
-    return [
-        f"{key}: {before.get(key, '(absent)')} there, {now.get(key, '(absent)')} now"
-        for key in sorted(before.keys() | now.keys())
-        if key in other_code
-        or (before.get(key) != now.get(key) and key.split(".")[0] not in VOLATILE_KEYS)
-    ]
-
-
-def same_code_in(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Whether files and modules that settings name are the same in both; paths may differ."""
-    paths = [list(map(str, config.get("search_path") or ())) for config in (before, now)]
-    return same_code([str(now.get(key)) for key in NAMING_KEYS], *paths)
