@@ -8,7 +8,7 @@ import pytest
 import wandb
 
 from torchrl_l1.cli import main, robustify
-from torchrl_l1.deployment import robust_controller
+from torchrl_l1.deployment import robustification
 from torchrl_l1.envs import suite
 from torchrl_l1.experiment.evaluate import TrainedRun
 from torchrl_l1.experiment.settings import METRPORecipe
@@ -94,7 +94,7 @@ def test_what_cannot_be_tested_is_refused_before_data_are_collected(
     def collect(*arguments):
         raise AssertionError("data are collected")
 
-    monkeypatch.setattr(robust_controller, "collect", collect)
+    monkeypatch.setattr(robustification, "collect", collect)
     env = "gymnasium/Pendulum-v1" if options == ["--mass", "2"] else "inverted_pendulum"
     policy = f"{policy_file}:balance"
     assert message in refused(["robustify", env, "--policy", policy, *options], capsys)
