@@ -294,6 +294,32 @@ def test_what_is_not_finite_stays_in_its_environment(which, value):
 
 
 @pytest.mark.parametrize(
+    ("made_for", "used_with"), [(None, "residuals"), ("residuals", "sum"), ("sum", "residuals")]
+)
+def test_a_state_of_other_settings_is_refused(made_for, used_with):
+    made = None if made_for is None else L1Config.robust(0.05, covariance=made_for)
+    state = init([2], 3, 1, made)
+    inputs = torch.zeros(2, 3), torch.zeros(2, 1), torch.zeros(2, 3), torch.ones(2, 3, 1)
+    with pytest.raises(ValueError, match=r"other settings: make it with init\(.*config\)"):
+        step(L1Config.robust(0.05, covariance=used_with), state, *inputs)
+
+
+def test_residuals_of_which_nothing_is_known_are_white():
+    rng, estimates = np.random.default_rng(3), []
+    inputs = [
+        [torch.as_tensor(rng.normal(size=shape)) for shape in ((2, 3), (2, 1), (2, 3), (2, 3, 1))]
+        for _ in range(4)
+    ]
+    for covariance in ("residuals", "sum"):
+        config = L1Config.robust(0.05, covariance=covariance)
+        state = init([2], 3, 1, config, dtype=torch.float64)
+        for each in inputs:
+            _, state, _ = step(config, state, *each)
+        estimates.append(state.sigma_m)
+    torch.testing.assert_close(*estimates)
+
+
+@pytest.mark.parametrize(
     ("settings", "words"),
     [
         ({"alpha": 0.1}, "low-pass"),

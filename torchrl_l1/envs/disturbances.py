@@ -31,16 +31,32 @@ Value = float | Sequence[float] | Tensor | Draw
 class RandomSigns:
     """A magnitude with a sign of its own for each environment and entry, drawn at every reset.
 
+    Attributes:
+        magnitude: a number, one for each entry, one row for each environment, or drawn itself.
+
     Examples:
         >>> RandomSigns(0.3)(torch.Size([4, 6])).abs().unique()
         tensor([0.3000])
     """
 
-    magnitude: float
+    magnitude: Value
 
     def __call__(self, shape: torch.Size) -> Tensor:
-        """Draw from torch's global generator."""
-        return self.magnitude * (1 - 2 * torch.randint(2, shape).float())
+        """Draw from torch's global generator.
+
+        Raises:
+            ValueError: for magnitudes that do not fit the shape.
+        """
+        given = self.magnitude(shape) if callable(self.magnitude) else self.magnitude
+        magnitude = torch.as_tensor(given)
+        try:
+            magnitude = magnitude.expand(shape)
+        except RuntimeError:
+            raise ValueError(
+                f"RandomSigns has magnitudes of shape {tuple(magnitude.shape)}, expected one "
+                f"number, one for each entry, or one row for each environment of {tuple(shape)}"
+            ) from None
+        return magnitude * (1 - 2 * torch.randint(2, shape, device=magnitude.device).float())
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,12 @@ from torchrl_l1.envs.actuators import (
     Stiction,
     WalkBias,
 )
-from torchrl_l1.envs.disturbances import EnvironmentTransform, RandomSigns, where_stepped
+from torchrl_l1.envs.disturbances import (
+    EnvironmentTransform,
+    RandomSigns,
+    Value,
+    where_stepped,
+)
 from torchrl_l1.envs.plant import check_plant
 from torchrl_l1.envs.sensors import SensorBias, SensorDelay, SensorDropout
 
@@ -197,7 +202,7 @@ def _plant(name: str, **described: Any) -> Any:
     return disturbance(name, None, acts_on="plant", **described)
 
 
-def _signs(magnitude: float) -> ActuatorBias:
+def _signs(magnitude: Value) -> ActuatorBias:
     return ActuatorBias(RandomSigns(magnitude))
 
 
