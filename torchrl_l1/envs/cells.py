@@ -219,12 +219,12 @@ class TorchRLCell:
             spec = getattr(inner, "spec", None)
             is_single = isinstance(inner, gymnasium.Env)
             told = [
+                getattr(env, "max_steps", None),
                 getattr(inner, "_step_limit", None),
                 _time_limit(inner) if is_single else getattr(spec, "max_episode_steps", None),
             ]
             skipped = frames * getattr(env, "wrapper_frame_skip", 1)
             limits += [_in_steps(limit, skipped) for limit in told]
-            limits.append(_in_steps(getattr(env, "max_steps", None), frames))
         return min((limit for limit in limits if _is_limit(limit)), default=None)
 
     def simulation(self) -> Any:

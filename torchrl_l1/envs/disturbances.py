@@ -141,6 +141,22 @@ class EnvironmentTransform(Transform):
                     f"{mine}, or around it, TransformedEnv(env, {other}(...), auto_unwrap=False)"
                 )
 
+    def begun(self, next_tensordict: TensorDictBase) -> Tensor | None:
+        """Where an environment that resets itself within a step has begun an episode.
+
+        Returns:
+            mask ``(*batch, 1)``, bool: what is observed there is the first of that episode;
+            ``None`` for environments that are reset from outside.
+        """
+        environment = self.container
+        is_native = "_torchrl_native_autoreset"
+        if environment is None or not environment.__dict__.get(is_native, False):
+            return None
+        flags = [next_tensordict.get(key, None) for key in environment.done_keys]
+        batch = next_tensordict.batch_size
+        over = [flag.reshape(*batch, -1).any(-1, True) for flag in flags if flag is not None]
+        return torch.stack(over).any(0)
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Refuse to work on stored data.
 

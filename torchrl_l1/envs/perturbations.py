@@ -119,7 +119,10 @@ class ObservationNoise(_UniformNoise):
         super().__init__(half_width, observation_key)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        noisy = self._noisy(next_tensordict.get(self.key))
+        clean = next_tensordict.get(self.key)
+        noisy, begun = self._noisy(clean), self.begun(next_tensordict)
+        if begun is not None:
+            noisy = torch.where(begun, clean, noisy)
         return next_tensordict.set(self.key, where_stepped(tensordict, self.key, noisy))
 
 
