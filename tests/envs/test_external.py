@@ -272,6 +272,14 @@ def test_environments_of_torchrl():
     )
 
 
+@pytest.mark.parametrize(("ends", "late"), [(3, False), (9, True)])
+def test_episodes_of_torchrl_end_as_they_say(ends, late):
+    # With a step counter it is TorchRL that steps it.
+    task = task_of(lambda: TransformedEnv(GymWrapper(Cart(ends=ends)), StepCounter(5)), horizon=8)
+    last = task.environment(1, seed=0).rollout(20)["next"][0, -1]
+    assert (bool(last["terminated"]), bool(last["truncated"])) == (not late, late)
+
+
 def test_batches_and_missing_vectors_of_torchrl_are_refused():
     with pytest.raises(ValueError, match="is a batch"):
         task_of(lambda: GymEnv("Pendulum-v1", num_envs=2))

@@ -204,7 +204,13 @@ def _of_wrapped(env: Any) -> float | None:
 
 
 def repeats(wrapper: Any) -> int:
-    """How often a wrapper of Gymnasium repeats an action, by the attribute that is customary."""
+    """How often a wrapper of Gymnasium repeats an action, by the attribute that is customary.
+
+    Examples:
+        >>> from types import SimpleNamespace
+        >>> repeats(SimpleNamespace(frame_skip=4)), repeats(SimpleNamespace())
+        (4, 1)
+    """
     skips = [wrapper.__dict__.get(name) for name in _REPEATS]
     return next((skip for skip in skips if type(skip) is int and skip > 0), 1)
 

@@ -193,7 +193,8 @@ class TorchRLCell:
         late = truncated is not None and bool(truncated.any())
         terminated = stepped.get("terminated", None)
         over = ended and not late if terminated is None else bool(terminated.any())
-        return self._observed(stepped), float(stepped["reward"].sum()), over, late or ended
+        late = late or (ended and not over)
+        return self._observed(stepped), float(stepped["reward"].sum()), over, late
 
     def _observed(self, data: TensorDictBase) -> np.ndarray:
         observation: np.ndarray = data["observation"].reshape(-1).float().numpy().copy()
