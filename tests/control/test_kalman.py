@@ -158,6 +158,28 @@ def test_the_estimate_reaches_the_cramer_rao_bound_where_least_squares_does_not(
         assert plain.square().mean() > 2 * bound[entry, entry]
 
 
+@pytest.mark.parametrize("scale", [1e-4, 3e3, 1e6])
+def test_the_units_of_an_action_do_not_matter(scale):
+    generator, found = torch.Generator().manual_seed(1), []
+    noise = 0.05 * torch.randn(100, 20, 3, generator=generator)
+    jacobian = torch.tensor([[0.1, 0.02], [0.05, -0.1], [0.0, 0.1]])
+    for unit in (1.0, scale):
+        units = torch.tensor([1.0, unit])
+        bounds = {"action_low": (-1.0, -unit), "action_high": (1.0, unit)}
+        config = L1Config.robust(0.05, process_noise=0.003, **bounds)
+        state, _, inputs = simulate(
+            config,
+            ResidualStatistics(0.05**2 * torch.eye(3)),
+            jacobian / units,
+            torch.tensor([0.3, -0.4]) * units,
+            noise,
+        )
+        deviation = state.covariance.unflatten(-1, (2, 2)).diagonal(dim1=-2, dim2=-1).sqrt()
+        found.append(torch.stack([inputs[-1] / units, deviation / units]))
+    torch.testing.assert_close(*found, atol=1e-3, rtol=1e-3)
+    assert found[0][0].abs().min() > 0.1
+
+
 def test_nothing_is_done_within_the_dead_zone_and_everything_far_beyond():
     posterior = Posterior(torch.tensor([0.19, -0.19, 2.0, 0.0]), 0.01 * torch.eye(4))
     acted = significant(posterior, 2.0)

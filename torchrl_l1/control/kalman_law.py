@@ -184,7 +184,8 @@ def estimate(
     others = unknown / scale
     columns, white = whitened(covariance + others @ others.mT, jacobian / scale, relative)
     white = white.squeeze(-1)
-    factor = kalman.factor(prior.covariance)
+    has_units = isinstance(config.half_range, tuple)
+    factor = kalman.factor(prior.covariance, half_range if has_units else None)
     posterior = kalman.measurement_update(prior, columns, white, factor)
     if config.forgetting < 1:
         # A residual far beyond what is expected counts for as much less, at once.
