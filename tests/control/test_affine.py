@@ -173,6 +173,34 @@ def test_agrees_with_algorithm_2(numpy_l1, on_switch, switch_on, filter_input):
     assert 5 < switches < 20 * batch
 
 
+class Weighed(Known):
+    def residual_covariance(self, x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        return torch.diag(torch.tensor([1e-4, 1.0, 1e-2, 4.0], dtype=x.dtype))
+
+
+@pytest.mark.parametrize("filter_input", ["current", "previous"])
+def test_the_executed_input_is_tested_whatever_weighs_the_estimate(filter_input):
+    # No switch, so that the input tested is the one executed.
+    config = L1Config(
+        DT, epsilon=1e9, estimator="weighted", filter_input=filter_input, action_low=-0.9
+    )
+    rng, model = np.random.default_rng(2), ActionJacobian(Weighed())
+    x, state = torch.as_tensor(rng.normal(size=(3, N))), init([3], N, M, dtype=torch.float64)
+    for t in range(5):
+        u_rl = torch.as_tensor(rng.uniform(-0.8, 0.8, size=(3, M)))
+        u, state, diagnostics = augment(config, model, state, x, u_rl)
+        pairs = [[row.numpy() for row in rows] for rows in (x, u, state.u_bar)]
+        errors = [
+            np.linalg.norm(numpy_model(a, b) - numpy_model(a, c) - numpy_gradient(a, c) @ (b - c))
+            for a, b, c in zip(*pairs, strict=True)
+        ]
+        if t:
+            found = diagnostics.affinization_error.squeeze(-1)
+            np.testing.assert_allclose(found, errors, rtol=1e-9, atol=1e-12)
+        x = x + torch_model(x, u + 0.3) + 0.1 * torch.as_tensor(rng.normal(size=(3, N)))
+    assert diagnostics.u_a.min() > 0.01
+
+
 def test_first_step_is_no_switch_and_adds_nothing():
     for epsilon in (0.0, 1.0):
         config = L1Config(DT, epsilon=epsilon)

@@ -30,6 +30,7 @@ from torchrl.modules.utils import get_primers_from_module
 from torchrl.objectives import ClipPPOLoss, SACLoss
 
 from torchrl_l1.control import ActionJacobian, L1Config, L1Controller, L1Transform, init, step
+from torchrl_l1.control.state import state_names
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.envs import BatchedMujocoEnv
 
@@ -70,6 +71,41 @@ def test_controller_and_transform_give_the_same_trajectory(config):
             outside["next", "l1", name], inside["next", "l1", name], atol=0, rtol=0
         )
     assert (outside["action"] != outside["l1", "u_rl"]).any()
+
+
+@pytest.mark.parametrize("preset", ["paper", "robust"])
+def test_environments_that_a_mask_leaves_out_keep_their_state(preset):
+    config = getattr(L1Config, preset)(0.04)
+    controller = L1Controller(make_model(), config)
+    base = BatchedMujocoEnv("inverted_pendulum", 3, seed=0)
+    env = TransformedEnv(base, controller.make_primer())
+    torch.manual_seed(2)
+    data = env.reset()
+    for t in range(5):
+        before = data["l1"].clone()
+        data["action"] = torch.rand(3, 1)
+        if t in (2, 3):
+            data["_step"] = torch.tensor([[True], [False], [True]])
+        data = env.step_mdp(env.step(controller(data))).exclude("_step")
+        for name in (*state_names(config), "u_exec", "prediction_error"):
+            same = (data["l1", name] == before[name]).flatten(1).all(-1)
+            if t in (2, 3):
+                assert same[1], name
+            if name == "x_hat":
+                assert same.tolist() == [False, t in (2, 3), False]
+
+
+def test_steps_of_another_policy_keep_the_state_that_a_mask_leaves_out():
+    controller = L1Controller(make_model(), CONFIG)
+    base = BatchedMujocoEnv("inverted_pendulum", 2, seed=0)
+    env = TransformedEnv(base, controller.make_primer())
+    data = env.step_mdp(env.step(controller(env.rand_action(env.reset()))))
+    x_hat = data["l1", "x_hat"].clone()
+    data = env.rand_action(data.exclude(("l1", "u_rl")))
+    data["_step"] = torch.tensor([[False], [True]])
+    data = env.step_mdp(env.step(data))
+    assert torch.equal(data["l1", "x_hat"][0], x_hat[0])
+    assert data["l1", "started"].flatten().tolist() == [True, False]
 
 
 @pytest.mark.parametrize("has_weights", [False, True])

@@ -158,6 +158,28 @@ def test_the_estimate_reaches_the_cramer_rao_bound_where_least_squares_does_not(
         assert plain.square().mean() > 2 * bound[entry, entry]
 
 
+@pytest.mark.parametrize("scale", [1e-4, 3e3, 1e6])
+def test_the_units_of_an_action_do_not_matter(scale):
+    generator, found = torch.Generator().manual_seed(1), []
+    noise = 0.05 * torch.randn(100, 20, 3, generator=generator)
+    jacobian = torch.tensor([[0.1, 0.02], [0.05, -0.1], [0.0, 0.1]])
+    for unit in (1.0, scale):
+        units = torch.tensor([1.0, unit])
+        bounds = {"action_low": (-1.0, -unit), "action_high": (1.0, unit)}
+        config = L1Config.robust(0.05, process_noise=0.003, **bounds)
+        state, _, inputs = simulate(
+            config,
+            ResidualStatistics(0.05**2 * torch.eye(3)),
+            jacobian / units,
+            torch.tensor([0.3, -0.4]) * units,
+            noise,
+        )
+        deviation = state.covariance.unflatten(-1, (2, 2)).diagonal(dim1=-2, dim2=-1).sqrt()
+        found.append(torch.stack([inputs[-1] / units, deviation / units]))
+    torch.testing.assert_close(*found, atol=1e-3, rtol=1e-3)
+    assert found[0][0].abs().min() > 0.1
+
+
 def test_nothing_is_done_within_the_dead_zone_and_everything_far_beyond():
     posterior = Posterior(torch.tensor([0.19, -0.19, 2.0, 0.0]), 0.01 * torch.eye(4))
     acted = significant(posterior, 2.0)
@@ -291,6 +313,32 @@ def test_what_is_not_finite_stays_in_its_environment(which, value):
     for _ in range(2):
         u, following, _ = step(config, following, *inputs())
     assert following.started.all() and u.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("made_for", "used_with"), [(None, "residuals"), ("residuals", "sum"), ("sum", "residuals")]
+)
+def test_a_state_of_other_settings_is_refused(made_for, used_with):
+    made = None if made_for is None else L1Config.robust(0.05, covariance=made_for)
+    state = init([2], 3, 1, made)
+    inputs = torch.zeros(2, 3), torch.zeros(2, 1), torch.zeros(2, 3), torch.ones(2, 3, 1)
+    with pytest.raises(ValueError, match=r"other settings: make it with init\(.*config\)"):
+        step(L1Config.robust(0.05, covariance=used_with), state, *inputs)
+
+
+def test_residuals_of_which_nothing_is_known_are_white():
+    rng, estimates = np.random.default_rng(3), []
+    inputs = [
+        [torch.as_tensor(rng.normal(size=shape)) for shape in ((2, 3), (2, 1), (2, 3), (2, 3, 1))]
+        for _ in range(4)
+    ]
+    for covariance in ("residuals", "sum"):
+        config = L1Config.robust(0.05, covariance=covariance)
+        state = init([2], 3, 1, config, dtype=torch.float64)
+        for each in inputs:
+            _, state, _ = step(config, state, *each)
+        estimates.append(state.sigma_m)
+    torch.testing.assert_close(*estimates)
 
 
 @pytest.mark.parametrize(

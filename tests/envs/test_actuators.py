@@ -46,6 +46,7 @@ from torchrl_l1.envs import (
     Stiction,
     Uniform,
     WalkBias,
+    disturbance_transforms,
 )
 
 
@@ -128,6 +129,38 @@ def test_bias_of_random_signs_is_drawn_anew_where_an_episode_starts():
     second = send(env, zero)
     assert torch.equal(second[[0, 2]], first[[0, 2]])
     assert not torch.equal(second[1], first[1])
+
+
+@pytest.mark.parametrize(
+    "magnitude",
+    [
+        [0.1, 0.2],
+        torch.tensor([0.1, 0.2]),
+        torch.tensor([[0.1], [0.2], [0.3]]),
+        Uniform(0.1, 0.3),
+        Uniform(0.1, 0.3, shared=True),
+    ],
+    ids=["entries", "tensor", "rows", "drawn", "drawn for each environment"],
+)
+def test_magnitudes_of_random_signs_are_values_like_any_other(magnitude):
+    torch.manual_seed(0)
+    (transform,) = disturbance_transforms(signs=magnitude)
+    env = TransformedEnv(Echo((3,), 2), transform)
+    env.reset()
+    received = send(env, torch.zeros(3, 2, dtype=torch.float64))
+    assert (received > 0).any() and (received < 0).any()
+    if isinstance(magnitude, Uniform):
+        assert (received.abs() >= 0.1).all() and (received.abs() < 0.3).all()
+        assert bool((received[:, 0].abs() == received[:, 1].abs()).all()) == magnitude.shared
+    else:
+        expected = torch.as_tensor(magnitude).double().expand(3, 2)
+        torch.testing.assert_close(received.abs(), expected)
+
+
+def test_magnitudes_that_do_not_fit_are_refused():
+    env = TransformedEnv(Echo((3,), 2), ActuatorBias(RandomSigns([0.1, 0.2, 0.3])))
+    with pytest.raises(ValueError, match=r"RandomSigns has magnitudes of shape \(3,\)"):
+        env.reset()
 
 
 @pytest.mark.parametrize(

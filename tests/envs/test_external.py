@@ -8,10 +8,27 @@ from gymnasium.spaces import Box, Dict, Discrete
 from gymnasium.wrappers import TimeLimit
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torchrl.envs import GymEnv, GymWrapper, SerialEnv, StepCounter, TransformedEnv
+from tensordict import TensorDict
+from torchrl.envs import (
+    Compose,
+    FrameSkipTransform,
+    GymEnv,
+    GymWrapper,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
 
 from torchrl_l1.control import time_step
-from torchrl_l1.envs import ExternalTask, Task, environment_source, get_task, make_env
+from torchrl_l1.envs import (
+    ExternalTask,
+    Task,
+    Uniform,
+    disturbed_model,
+    environment_source,
+    get_task,
+    make_env,
+)
 
 FORWARD = Box(-1.0, 1.0, (1,), np.float32)
 ANY = Box(-np.inf, np.inf, (2,), np.float64)
@@ -255,6 +272,14 @@ def test_environments_of_torchrl():
     )
 
 
+@pytest.mark.parametrize(("ends", "late"), [(3, False), (9, True)])
+def test_episodes_of_torchrl_end_as_they_say(ends, late):
+    # With a step counter it is TorchRL that steps it.
+    task = task_of(lambda: TransformedEnv(GymWrapper(Cart(ends=ends)), StepCounter(5)), horizon=8)
+    last = task.environment(1, seed=0).rollout(20)["next"][0, -1]
+    assert (bool(last["terminated"]), bool(last["truncated"])) == (not late, late)
+
+
 def test_batches_and_missing_vectors_of_torchrl_are_refused():
     with pytest.raises(ValueError, match="is a batch"):
         task_of(lambda: GymEnv("Pendulum-v1", num_envs=2))
@@ -271,6 +296,75 @@ def test_plants_of_gymnasiums_mujoco_can_be_changed():
         make_env(task, 2, wind=0.5)
     with pytest.raises(ValueError, match="mass changes the plant"):
         make_env("gymnasium/Pendulum-v1", 2, mass=2.0)
+
+
+def test_plants_of_gymnasiums_mujoco_have_values_of_their_own():
+    task = get_task("gymnasium/InvertedPendulum-v5")
+    actions = torch.linspace(-1, 1, 6).reshape(6, 1)
+
+    def masses(env):
+        models = [cell.simulation().model for cell in env.base_env.cells]
+        return [model.body_mass.sum() for model in models]
+
+    (plain,) = masses(make_env(task, 1, seed=0))
+    env = make_env(task, 2, seed=0, mass=[1.5, 3.0])
+    np.testing.assert_allclose(masses(env), [1.5 * plain, 3.0 * plain])
+    data = env.reset()
+    made = gymnasium.make("InvertedPendulum-v5").unwrapped
+    made.model = disturbed_model(made.model, {"mass": 3.0})
+    made.reset(seed=0)
+    state = data["observation"][1].double().numpy()
+    made.set_state(state[:2], state[2:])
+    env.base_env.cells[1].simulation().set_state(state[:2], state[2:])
+    for action in actions:
+        data = env.step_mdp(env.step(data.set("action", action.expand(2, 1))))
+        expected = made.step(action.numpy())[0]
+        np.testing.assert_allclose(data["observation"][1], expected, rtol=1e-5, atol=1e-7)
+    torch.manual_seed(0)
+    env = make_env(task, 2, seed=0, mass=Uniform(1.5, 3.0))
+    env.reset()
+    first = masses(env)
+    assert all(1.5 * plain < mass < 3.0 * plain for mass in first) and first[0] != first[1]
+    env.reset(TensorDict({"_reset": torch.tensor([[True], [False]])}, [2]))
+    second = masses(env)
+    assert second[0] != first[0] and second[1] == first[1]
+    with pytest.raises(ValueError, match="expected one number, or one for"):
+        make_env(task, 2, mass=[1.0, 2.0, 3.0])
+
+
+class Thrice(gymnasium.Wrapper):
+    """Takes each action three times, as some packages write it."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self._skip = 3
+
+    def step(self, action):
+        for _ in range(self._skip):
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            if terminated or truncated:
+                break
+        return observation, reward, terminated, truncated, info
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: GymEnv("Pendulum-v1", frame_skip=3),
+        lambda: TransformedEnv(GymEnv("Pendulum-v1"), FrameSkipTransform(3)),
+        lambda: GymWrapper(TimeLimit(Cart(), 200), frame_skip=3),
+        lambda: Thrice(TimeLimit(Cart(), 200)),
+        lambda: TimeLimit(Thrice(TimeLimit(Cart(), 500)), 67),
+        lambda: TransformedEnv(GymWrapper(Cart()), Compose(StepCounter(67), FrameSkipTransform(3))),
+    ],
+    ids=["wrapper", "transform", "own limit", "gymnasium", "limit around", "counter of steps"],
+)
+def test_horizons_count_steps_and_not_the_frames_that_they_skip(make):
+    task = task_of(make, horizon=None)
+    assert task.horizon == 67
+    # The environment itself ends there: given more, an episode is no longer.
+    data = task.environment(1, seed=0, max_steps=100).rollout(100)
+    assert data.shape == (1, 67) and data["next", "truncated"][0, -1]
 
 
 def test_a_reward_that_is_not_known_is_said():

@@ -143,16 +143,54 @@ def test_refusals():
         SensorBias(0.1)(TensorDict({"observation": torch.zeros(2, 2)}, batch_size=[2]))
 
 
-def test_environments_that_reset_themselves_are_disturbed_once():
-    # There nothing is merged afterwards: what the others read has been disturbed already.
-    env = TransformedEnv(Counter(), SensorBias(0.5))
-    env.reset()
-    seen = step(env)
-    fresh = torch.where(torch.tensor([[True], [False], [False]]), 0.0, seen)
-    mask = TensorDict({"_reset": torch.tensor([[True], [False], [False]])}, batch_size=[3])
-    state = TensorDict({"observation": fresh}, batch_size=[3])
-    after = env.transform._reset_on_native_autoreset(mask, state)["observation"]
-    assert after[:, 0].tolist() == [0.5, 1.5, 1.5]
+class SelfResetting(Counter):
+    """Begins an episode within the step that ends one, as simulators on a GPU do."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._torchrl_native_autoreset = True
+
+    def _step(self, tensordict: TensorDict) -> TensorDict:
+        out = super()._step(tensordict)
+        over = (self.count >= torch.tensor([[2.0], [3.0], [9.0]])).any(-1, keepdim=True)
+        self.count = torch.where(over, 0.0, self.count)
+        out["done"], out["terminated"] = over, over.clone()
+        return out.set("observation", self.count.clone())
+
+
+@pytest.mark.parametrize(
+    ("chain", "expected"),
+    [
+        ([SensorBias(0.5)], [[0.5, 1.5, 0.5, 1.5, 0.5], [0.5, 1.5, 2.5, 0.5, 1.5]]),
+        ([SensorDelay(1)], [[0, 0, 0, 0, 0], [0, 0, 1, 0, 0]]),
+        ([SensorDropout(1.0)], [[0, 0, 0, 0, 0], [0, 0, 0, 0, 0]]),
+        (
+            [SensorDelay(1), SensorBias(0.5)],
+            [[0.5, 0.5, 0.5, 0.5, 0.5], [0.5, 0.5, 1.5, 0.5, 0.5]],
+        ),
+        (
+            [SensorBias(0.5), SensorDelay(1)],
+            [[0.5, 0.5, 0.5, 0.5, 0.5], [0.5, 0.5, 1.5, 0.5, 0.5]],
+        ),
+    ],
+    ids=["bias", "delay", "dropout", "delay and bias", "bias and delay"],
+)
+def test_environments_that_reset_themselves_are_disturbed_once(chain, expected):
+    env = TransformedEnv(SelfResetting(), Compose(*chain))
+    seen = env.rollout(5, break_when_any_done=False)["observation"]
+    assert seen[:2, :, 0].tolist() == expected
+
+
+def test_first_observations_of_environments_that_reset_themselves_are_free_of_noise():
+    torch.manual_seed(0)
+    env = TransformedEnv(
+        SelfResetting(), Compose(ObservationNoise(0.1), SensorBias(RandomSigns(1.0)))
+    )
+    seen = env.rollout(6, break_when_any_done=False)["observation"][0]
+    first = seen[::2]
+    assert torch.equal(first.abs(), torch.ones(3, 2, dtype=torch.float64))
+    assert (first != first[0]).any()  # drawn anew
+    assert (seen[1::2] != first + 1).all() and (seen[1::2] - first - 1).abs().max() < 0.1
 
 
 @pytest.mark.parametrize(

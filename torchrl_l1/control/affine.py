@@ -24,7 +24,7 @@ from torchrl_l1.control.signals import (
     wide,
     wide_state,
 )
-from torchrl_l1.control.state import L1Diagnostics, L1State
+from torchrl_l1.control.state import L1Diagnostics, L1State, ResidualStatistics
 
 BLOCK = 128
 """Rows of a batch that the ensemble evaluates at once on a processor.
@@ -207,11 +207,10 @@ def augment_silently(
     u_bar, change, jacobian = affinization
     # A prediction that is not finite at the tested input counts like one at the operating point.
     believed = (error < torch.inf) | fresh
-    restart = residuals = None
+    restart = None
     if config.on_switch == "reset":
         restart, control = switch, None
-    if config.estimator == "weighted":
-        residuals = model.residual_statistics(observation, u_bar, config.covariance)
+    residuals = _residuals(config, model, observation, u_bar)
     u, following, terms = law.respond(
         config,
         state,
@@ -278,8 +277,21 @@ def _tested_input(
     if control is None:
         # The executed input depends on the Jacobian, through this step's estimate.
         change, jacobian = model.value_and_jacobian(observation, u_bar)
-        return law.respond(config, state, observation, u_rl, change, jacobian, u_bar)[0]
+        residuals = _residuals(config, model, observation, u_bar)
+        u, *_ = law.respond(
+            config, state, observation, u_rl, change, jacobian, u_bar, None, residuals
+        )
+        return u
     return narrow(control.u, u_rl.dtype)
+
+
+def _residuals(
+    config: L1Config, model: ActionJacobian, observation: Tensor, u_bar: Tensor
+) -> ResidualStatistics | None:
+    """What the adaptive law weighs by, if it does."""
+    if config.estimator != "weighted":
+        return None
+    return model.residual_statistics(observation, u_bar, config.covariance)
 
 
 def make_step(

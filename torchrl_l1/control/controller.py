@@ -185,6 +185,10 @@ class L1Primer(TensorDictPrimer):
         nested = next_tensordict.get(self.key, None)
         if nested is None or nested.get(self._state_names[0], None) is None:
             nested = self._without_controller(tensordict)
+        stepped = tensordict.get("_step", None)
+        if stepped is not None:
+            previous = tensordict.get(self.key).select(*nested.keys(), strict=False)
+            nested = nested.where(stepped.reshape(nested.batch_size), previous, pad=0)
         # The controller knew nothing of the observation to come.
         nested = nested.clone(False)
         self._seal(nested, next_tensordict)

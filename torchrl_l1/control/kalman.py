@@ -35,9 +35,18 @@ def time_update(covariance: Tensor, process_noise: Tensor | float) -> Tensor:
     return covariance + torch.diag_embed(variance)
 
 
-def factor(covariance: Tensor) -> Tensor:
-    r"""Cholesky factor :math:`L` of a covariance ``(..., m, m)``."""
-    return torch.linalg.cholesky_ex(_bolstered(covariance))[0]
+def factor(covariance: Tensor, units: Tensor | None = None) -> Tensor:
+    r"""Cholesky factor :math:`L` of a covariance ``(..., m, m)``.
+
+    Args:
+        covariance: positive definite but for rounding.
+        units: what one is of each entry ``(m,)``, where they are of different sizes: the digits of
+            the small ones would be lost beside the large ones.
+    """
+    if units is None:
+        return torch.linalg.cholesky_ex(_bolstered(covariance))[0]
+    relative = covariance / (units.unsqueeze(-1) * units)
+    return units.unsqueeze(-1) * torch.linalg.cholesky_ex(_bolstered(relative))[0]
 
 
 def measurement_update(

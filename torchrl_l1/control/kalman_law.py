@@ -146,9 +146,12 @@ def estimate(
 
     Returns:
         the posterior and what led to it.
+
+    Raises:
+        ValueError: if the state is that of other settings.
     """
     state, observation = wide_state(state), wide(observation)
-    assert state.covariance is not None and state.noise is not None and state.jacobian is not None
+    past = _memory(config, state)
     n, m = observation.shape[-1], state.q.shape[-1]
     fresh = ~state.started if restart is None else ~state.started | restart
     statistics = _unit(observation) if residuals is None else residuals
@@ -160,14 +163,14 @@ def estimate(
         torch.where(
             fresh.unsqueeze(-1),
             initial,
-            kalman.time_update(state.covariance.unflatten(-1, (m, m)), process_noise),
+            kalman.time_update(past.covariance.unflatten(-1, (m, m)), process_noise),
         ),
     )
-    seen = state.jacobian.masked_fill(fresh, 0.0).unflatten(-1, (n, m))
+    seen = past.jacobian.masked_fill(fresh, 0.0).unflatten(-1, (n, m))
     innovation = (observation - state.x_hat).masked_fill(fresh, 0.0)
 
     covariance = _expected_covariance(config, state, statistics, fresh)
-    noise = state.noise.masked_fill(fresh, 1.0)
+    noise = past.noise.masked_fill(fresh, 1.0)
     larger = noise.clamp_min(1.0)
     # From observations that are noisier than its data were, a model errs in a lasting way too: the
     # policy reacts to the noise, and the mean of a nonlinear function is not that of its argument.
@@ -181,7 +184,8 @@ def estimate(
     others = unknown / scale
     columns, white = whitened(covariance + others @ others.mT, jacobian / scale, relative)
     white = white.squeeze(-1)
-    factor = kalman.factor(prior.covariance)
+    has_units = isinstance(config.half_range, tuple)
+    factor = kalman.factor(prior.covariance, half_range if has_units else None)
     posterior = kalman.measurement_update(prior, columns, white, factor)
     if config.forgetting < 1:
         # A residual far beyond what is expected counts for as much less, at once.
@@ -252,7 +256,6 @@ def follow(
     reach = like(observation, config.half_range)
     invisible = without_effect(jacobian, torch.maximum(observation.abs(), x_hat.abs()), reach)
     jacobian = jacobian * ~invisible.unsqueeze(-2)
-    assert state.covariance is not None
     following = L1State(
         x_hat=x_hat.masked_fill(non_finite, 0.0),
         u_bar=u.masked_fill(non_finite, 0.0),
@@ -263,7 +266,7 @@ def follow(
         covariance=posterior.covariance.flatten(-2),
         noise=estimated.noise.masked_fill(non_finite, 1.0),
         jacobian=jacobian.flatten(-2).masked_fill(non_finite, 0.0),
-        residual_covariance=_remembered(state, residuals, non_finite),
+        residual_covariance=_remembered(state, residuals, observation, non_finite),
     )
     terms = Terms(
         -estimated.innovation,
@@ -277,6 +280,25 @@ def follow(
     )
     u = torch.where(finite, narrow(u, policy.dtype), policy)
     return u, narrow_entries(following, dtype), terms
+
+
+class _Memory(NamedTuple):
+    """Those entries of a state that the filter needs."""
+
+    covariance: Tensor
+    noise: Tensor
+    jacobian: Tensor
+
+
+def _memory(config: L1Config, state: L1State) -> _Memory:
+    covariance, noise, jacobian = state.covariance, state.noise, state.jacobian
+    expected, varies = state.residual_covariance, config.covariance != "residuals"
+    if covariance is None or noise is None or jacobian is None or varies == (expected is None):
+        raise ValueError(
+            "the state is that of a controller with other settings: make it with "
+            "init(batch_size, observation_dim, action_dim, config)"
+        )
+    return _Memory(covariance, noise, jacobian)
 
 
 def _expected_covariance(
@@ -296,11 +318,11 @@ def _expected_covariance(
 
 
 def _remembered(
-    state: L1State, residuals: ResidualStatistics | None, non_finite: Tensor
+    state: L1State, residuals: ResidualStatistics | None, observation: Tensor, non_finite: Tensor
 ) -> Tensor | None:
     if state.residual_covariance is None:
         return None
-    assert residuals is not None, "a covariance that depends on state and action must be given"
+    residuals = _unit(observation) if residuals is None else residuals
     shape = state.residual_covariance.shape
     return residuals.covariance.flatten(-2).expand(shape).masked_fill(non_finite, 0.0)
 

@@ -197,11 +197,22 @@ def _of_wrapped(env: Any) -> float | None:
     while getattr(env, "env", None) is not None and hasattr(env, "unwrapped"):
         if env is env.unwrapped:
             break
-        skips = [env.__dict__.get(name) for name in _REPEATS]
-        frames *= next((skip for skip in skips if type(skip) is int and skip > 0), 1)
+        frames *= repeats(env)
         env = env.env
     told = _told(env)
     return None if told is None else told * frames
+
+
+def repeats(wrapper: Any) -> int:
+    """How often a wrapper of Gymnasium repeats an action, by the attribute that is customary.
+
+    Examples:
+        >>> from types import SimpleNamespace
+        >>> repeats(SimpleNamespace(frame_skip=4)), repeats(SimpleNamespace())
+        (4, 1)
+    """
+    skips = [wrapper.__dict__.get(name) for name in _REPEATS]
+    return next((skip for skip in skips if type(skip) is int and skip > 0), 1)
 
 
 def _told(env: Any) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -12,11 +13,11 @@ import torch
 from gymnasium.spaces import Box, Dict
 from tensordict import TensorDictBase
 from torchrl.data import Bounded
-from torchrl.envs import EnvBase, GymWrapper, StepCounter, TransformedEnv
+from torchrl.envs import EnvBase, FrameSkipTransform, GymWrapper, StepCounter, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.envs.utils import step_mdp
 
-from torchrl_l1.control import time_step
+from torchrl_l1.control import repeats, time_step
 from torchrl_l1.envs.known_rewards import Outcome, known_outcome
 from torchrl_l1.envs.sources import check_keys, simulation_of, vector_environment, vectors
 
@@ -134,14 +135,7 @@ class GymnasiumCell:
 
     def horizon(self) -> int | None:
         """See :class:`Cell`."""
-        env: Any = self.env
-        limits = []
-        while env is not env.unwrapped:
-            limits.append(env.__dict__.get("_max_episode_steps"))
-            env = env.env
-        told = [limit for limit in limits if isinstance(limit, int) and limit > 0]
-        spec = self.env.spec
-        return min(told, default=None if spec is None else spec.max_episode_steps)
+        return _time_limit(self.env)
 
     def simulation(self) -> Any:
         """See :class:`Cell`."""
@@ -199,7 +193,8 @@ class TorchRLCell:
         late = truncated is not None and bool(truncated.any())
         terminated = stepped.get("terminated", None)
         over = ended and not late if terminated is None else bool(terminated.any())
-        return self._observed(stepped), float(stepped["reward"].sum()), over, late or ended
+        late = late or (ended and not over)
+        return self._observed(stepped), float(stepped["reward"].sum()), over, late
 
     def _observed(self, data: TensorDictBase) -> np.ndarray:
         observation: np.ndarray = data["observation"].reshape(-1).float().numpy().copy()
@@ -213,16 +208,25 @@ class TorchRLCell:
         """See :class:`Cell`."""
         env: EnvBase = self.env
         limits: list[Any] = []
+        frames = 1
         while isinstance(env, TransformedEnv):
-            limits += [t.max_steps for t in env.transform.modules() if isinstance(t, StepCounter)]
+            chain = list(env.transform.modules())
+            # They count what they are asked for, however many frames that is.
+            limits += [t.max_steps for t in chain if isinstance(t, StepCounter)]
+            frames *= math.prod(t.frame_skip for t in chain if isinstance(t, FrameSkipTransform))
             env = env.base_env
         if not isinstance(env, BatchedEnvBase):  # which would ask its members
             inner = getattr(env, "_env", None)  # Gymnasium's or dm_control's
             spec = getattr(inner, "spec", None)
-            limits += [getattr(env, "max_steps", None), getattr(inner, "_step_limit", None)]
-            limits.append(getattr(spec, "max_episode_steps", None))
-        found = [int(x) for x in limits if isinstance(x, (int, float)) and 0 < x < float("inf")]
-        return min(found) if found else None
+            is_single = isinstance(inner, gymnasium.Env)
+            told = [
+                getattr(env, "max_steps", None),
+                getattr(inner, "_step_limit", None),
+                _time_limit(inner) if is_single else getattr(spec, "max_episode_steps", None),
+            ]
+            skipped = frames * getattr(env, "wrapper_frame_skip", 1)
+            limits += [_in_steps(limit, skipped) for limit in told]
+        return min((limit for limit in limits if _is_limit(limit)), default=None)
 
     def simulation(self) -> Any:
         """See :class:`Cell`."""
@@ -235,6 +239,27 @@ class TorchRLCell:
     def close(self) -> None:
         """See :class:`Cell`."""
         self.env.close(raise_if_closed=False)
+
+
+def _is_limit(limit: object) -> bool:
+    return isinstance(limit, (int, float)) and 0 < limit < math.inf
+
+
+def _in_steps(limit: Any, frames: int) -> int | None:
+    """A limit in frames, of which a step takes several."""
+    return math.ceil(limit / frames) if _is_limit(limit) else None
+
+
+def _time_limit(env: Any) -> int | None:
+    """Steps of an episode of Gymnasium's, by its shortest time limit."""
+    spec, frames = env.spec, 1
+    told = []
+    while env is not env.unwrapped:
+        frames *= repeats(env)
+        told.append(_in_steps(env.__dict__.get("_max_episode_steps"), frames))
+        env = env.env
+    found = [limit for limit in told if limit is not None]
+    return min(found, default=None if spec is None else spec.max_episode_steps)
 
 
 def _no_actions(name: str, found: object) -> str:

@@ -31,16 +31,32 @@ Value = float | Sequence[float] | Tensor | Draw
 class RandomSigns:
     """A magnitude with a sign of its own for each environment and entry, drawn at every reset.
 
+    Attributes:
+        magnitude: a number, one for each entry, one row for each environment, or drawn itself.
+
     Examples:
         >>> RandomSigns(0.3)(torch.Size([4, 6])).abs().unique()
         tensor([0.3000])
     """
 
-    magnitude: float
+    magnitude: Value
 
     def __call__(self, shape: torch.Size) -> Tensor:
-        """Draw from torch's global generator."""
-        return self.magnitude * (1 - 2 * torch.randint(2, shape).float())
+        """Draw from torch's global generator.
+
+        Raises:
+            ValueError: for magnitudes that do not fit the shape.
+        """
+        given = self.magnitude(shape) if callable(self.magnitude) else self.magnitude
+        magnitude = torch.as_tensor(given)
+        try:
+            magnitude = magnitude.expand(shape)
+        except RuntimeError:
+            raise ValueError(
+                f"RandomSigns has magnitudes of shape {tuple(magnitude.shape)}, expected one "
+                f"number, one for each entry, or one row for each environment of {tuple(shape)}"
+            ) from None
+        return magnitude * (1 - 2 * torch.randint(2, shape, device=magnitude.device).float())
 
 
 @dataclass(frozen=True)
@@ -124,6 +140,22 @@ class EnvironmentTransform(Transform):
                     f"is before it, which would disturb it in another way: put {other} before "
                     f"{mine}, or around it, TransformedEnv(env, {other}(...), auto_unwrap=False)"
                 )
+
+    def begun(self, next_tensordict: TensorDictBase) -> Tensor | None:
+        """Where an environment that resets itself within a step has begun an episode.
+
+        Returns:
+            mask ``(*batch, 1)``, bool: what is observed there is the first of that episode;
+            ``None`` for environments that are reset from outside.
+        """
+        environment = self.container
+        is_native = "_torchrl_native_autoreset"
+        if environment is None or not environment.__dict__.get(is_native, False):
+            return None
+        flags = [next_tensordict.get(key, None) for key in environment.done_keys]
+        batch = next_tensordict.batch_size
+        over = [flag.reshape(*batch, -1).any(-1, True) for flag in flags if flag is not None]
+        return torch.stack(over).any(0)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Refuse to work on stored data.

@@ -19,7 +19,7 @@ from torchrl_l1.checks import check_optional_count
 from torchrl_l1.envs.cells import PAGE, Cell, GymnasiumCell, TorchRLCell
 from torchrl_l1.envs.known_rewards import Outcome
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv, keep_others, stepped_rows
-from torchrl_l1.envs.plant import disturbed_model
+from torchrl_l1.envs.plant import Plant, disturbed_model
 from torchrl_l1.envs.references import making
 from torchrl_l1.envs.sources import EnvironmentSource, environment_source
 from torchrl_l1.envs.task import BadAction, RewardFn, Scalars, Task
@@ -185,7 +185,8 @@ class ExternalEnv(EnvBase):
         max_steps: steps after which an episode is truncated; the task's horizon if ``None``.
         dtype: floating dtype of observation, action and reward.
         threads: no more than one thread steps them.
-        plant: changes of the plant by name, numbers, of Gymnasium's MuJoCo environments.
+        plant: changes of the plant by name, of Gymnasium's MuJoCo environments; each a number, one
+            for each environment, or drawn at resets.
 
     Raises:
         ValueError: if a count is not positive, or for a plant that cannot be changed so.
@@ -215,10 +216,9 @@ class ExternalEnv(EnvBase):
         self.task, self.num_envs, self.max_steps, self._dtype = task, num_envs, max_steps, dtype
         task.check_disturbances(list(plant or {}))
         self.cells = [task._cell(limited=False) for _ in range(num_envs)]
-        for cell in self.cells:
-            if plant:
-                simulation = cell.simulation()
-                simulation.model = disturbed_model(simulation.model, plant)
+        self._models = [cell.simulation().model for cell in self.cells if plant]
+        self._plant = Plant(self._models[0], num_envs, plant) if plant else None
+        self._change_plant(np.arange(num_envs))
         self._low = np.stack([cell.low for cell in self.cells])
         self._high = np.stack([cell.high for cell in self.cells])
         self._steps = np.zeros(num_envs, dtype=np.int64)
@@ -243,6 +243,13 @@ class ExternalEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         self._rng = np.random.default_rng(seed)
 
+    def _change_plant(self, indices: np.ndarray) -> None:
+        values = {} if self._plant is None else self._plant.values
+        for index in indices if values else ():
+            changes = {name: float(each[index]) for name, each in values.items()}
+            changed = disturbed_model(self._models[index], changes)
+            self.cells[index].simulation().model = changed
+
     def _emitted(self) -> Tensor:
         return torch.from_numpy(self._observation.copy()).to(self._dtype)
 
@@ -251,6 +258,9 @@ class ExternalEnv(EnvBase):
         indices = np.arange(self.num_envs)
         if mask is not None:
             indices = np.flatnonzero(mask.reshape(self.num_envs, -1).any(-1).numpy())
+        if self._plant is not None and self._plant.is_drawn:
+            self._plant.redraw(indices)
+            self._change_plant(indices)
         for index in indices:
             self._observation[index] = self.cells[index].reset(int(self._rng.integers(2**31)))
         self._steps[indices] = 0

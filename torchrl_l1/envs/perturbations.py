@@ -23,7 +23,12 @@ from torchrl_l1.envs.actuators import (
     Stiction,
     WalkBias,
 )
-from torchrl_l1.envs.disturbances import EnvironmentTransform, RandomSigns, where_stepped
+from torchrl_l1.envs.disturbances import (
+    EnvironmentTransform,
+    RandomSigns,
+    Value,
+    where_stepped,
+)
 from torchrl_l1.envs.plant import check_plant
 from torchrl_l1.envs.sensors import SensorBias, SensorDelay, SensorDropout
 
@@ -114,7 +119,10 @@ class ObservationNoise(_UniformNoise):
         super().__init__(half_width, observation_key)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        noisy = self._noisy(next_tensordict.get(self.key))
+        clean = next_tensordict.get(self.key)
+        noisy, begun = self._noisy(clean), self.begun(next_tensordict)
+        if begun is not None:
+            noisy = torch.where(begun, clean, noisy)
         return next_tensordict.set(self.key, where_stepped(tensordict, self.key, noisy))
 
 
@@ -197,7 +205,7 @@ def _plant(name: str, **described: Any) -> Any:
     return disturbance(name, None, acts_on="plant", **described)
 
 
-def _signs(magnitude: float) -> ActuatorBias:
+def _signs(magnitude: Value) -> ActuatorBias:
     return ActuatorBias(RandomSigns(magnitude))
 
 

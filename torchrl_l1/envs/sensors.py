@@ -36,6 +36,10 @@ class _Sensor(HeldDisturbance):
         seen, following = self._read(reading)
         if following:
             self._keep(following, tensordict.get("_step", None), reading.shape[:-1])
+        begun = self.begun(next_tensordict)
+        if begun is not None:
+            self._restart(reading, begun)
+            seen = torch.where(begun, self._first(reading), seen)
         return next_tensordict.set(self.key, where_stepped(tensordict, self.key, seen))
 
     def _reset(
@@ -50,8 +54,6 @@ class _Sensor(HeldDisturbance):
             chosen = reset.reshape(*reading.shape[:-1], -1).any(-1, keepdim=True)
             seen = torch.where(chosen, seen, reading)
         return tensordict_reset.set(self.key, seen)
-
-    _reset_on_native_autoreset = _reset
 
 
 class SensorBias(_Sensor):
