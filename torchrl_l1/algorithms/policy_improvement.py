@@ -161,7 +161,7 @@ class PolicyImprovement:
 
     def _improve(self, observation: Tensor, action: Tensor, advantage: Tensor) -> TRPOReport:
         policy, config = self.policy, self.config.trpo
-        if policy.is_plain:
+        if policy.is_plain and all(part.requires_grad for part in policy.parameters()):
             inputs = policy.normalizer.normalize(observation)
             return gaussian_trpo_step(
                 policy.mean, policy.log_std, inputs, action, advantage, config

@@ -70,14 +70,17 @@ def conjugate_gradient(
         matvec: ``v -> A v`` for vectors ``(d,)``.
         b: right-hand side ``(d,)``.
         iterations: at most this many products with ``A``.
-        tolerance: stop once the squared residual falls below it.
+        tolerance: stop once the squared residual falls to it, or to this share of that of ``b``
+            where ``b`` itself is as small.
     """
     x = torch.zeros_like(b)
     residual = b.clone()
     direction = b.clone()
     squared = residual @ residual
+    if squared < tolerance:
+        tolerance = tolerance * squared.item()
     for _ in range(iterations):
-        if squared < tolerance:
+        if squared <= tolerance:
             break
         product = matvec(direction)
         step = squared / (direction @ product)
@@ -128,7 +131,7 @@ def trpo_step(
         config: see :class:`TRPOConfig`.
 
     Raises:
-        ValueError: if the advantages are not finite.
+        ValueError: if the advantages are not finite, or if there is not one density per sample.
     """
     return take_step(_AutogradProblem(actor, data, config), data["advantage"], config)
 
@@ -194,6 +197,13 @@ class _AutogradProblem:
         with torch.no_grad():
             self.old = actor.get_dist(data)
             self.old_log_prob = self.old.log_prob(data["action"])
+            wanted = data["advantage"].squeeze(-1).shape
+            if self.old_log_prob.shape != wanted:
+                raise ValueError(
+                    f"TRPO: the actor's {type(self.old).__name__} gives log-densities of shape "
+                    f"{tuple(self.old_log_prob.shape)} for advantages of {tuple(wanted)}: it must "
+                    "be one of whole actions, such as IndependentNormal of TorchRL"
+                )
             self.before = self._surrogate(self.old)
         self._divergence_gradient: Tensor | None = None
 
