@@ -25,7 +25,8 @@ class TRPOConfig:
         max_kl: bound on the mean KL divergence between old and new policy, in nats.
         damping: multiple of the identity added to the Fisher matrix.
         cg_iterations: conjugate gradient iterations.
-        fisher_fraction: share of the samples on which the Fisher matrix is estimated.
+        fisher_fraction: share of the samples on which the Fisher matrix is estimated: every tenth,
+            for 0.1, in the order in which they are given, which must not repeat itself with them.
         backtrack_ratio: factor between successive line search candidates.
         max_backtracks: number of candidates tried.
         accept_ratio: least ratio of actual to predicted improvement of the surrogate.
