@@ -230,3 +230,11 @@ def test_a_policy_of_another_type_is_refused_before_work_starts() -> None:
             make(l1=None)
     finally:
         torch.set_default_dtype(torch.float32)
+
+
+def test_numbers_of_steps_are_whole_and_there_are_some() -> None:
+    with pytest.raises(ValueError, match="imagined_steps must be an integer, got 200"):
+        tiny(imagined_steps=2e2)
+    for horizon in (0, -3, 25.0):
+        with pytest.raises(ValueError, match=f"horizon must be .* or null, got {horizon}"):
+            METRPO("inverted_pendulum", tiny(), horizon=horizon)  # type: ignore[arg-type]
