@@ -167,6 +167,21 @@ def test_a_density_per_entry_of_the_action_is_refused() -> None:
     assert torch.equal(parameters_to_vector(actor.parameters()), before)
 
 
+def test_samples_that_carry_a_graph_are_samples_all_the_same() -> None:
+    torch.manual_seed(0)
+    policy = GaussianPolicy(3, 2, (4,), std=0.7)
+    data = TensorDict({"observation": torch.randn(400, 3)}, batch_size=[400])
+    with set_exploration_type(ExplorationType.RANDOM):
+        data = make_actor(policy)(data)  # drawn by reparametrisation
+    data["advantage"] = data["action"][:, :1] * data["observation"][:, :1]
+    assert data["action"].requires_grad
+    copy = deepcopy(policy)
+    expected = trpo_step(make_actor(copy), data.detach(), TRPOConfig())
+    assert trpo_step(make_actor(policy), data, TRPOConfig()) == expected
+    found, other = (parameters_to_vector(one.parameters()) for one in (policy, copy))
+    assert torch.equal(found, other)
+
+
 @pytest.mark.parametrize("closed_form", [False, True])
 def test_the_scale_of_the_advantages_does_not_matter(closed_form: bool) -> None:
     torch.manual_seed(0)

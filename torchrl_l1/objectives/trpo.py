@@ -193,6 +193,7 @@ class _AutogradProblem:
     def __init__(
         self, actor: ProbabilisticTensorDictSequential, data: TensorDictBase, config: TRPOConfig
     ) -> None:
+        data = data.detach()  # how samples were drawn is no part of the surrogate
         self.actor, self.data, self.config = actor, data, config
         self.parameters = [p for p in actor.parameters() if p.requires_grad]
         with torch.no_grad():
