@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 
 import pytest
 import torch
@@ -238,3 +239,14 @@ def test_numbers_of_steps_are_whole_and_there_are_some() -> None:
     for horizon in (0, -3, 25.0):
         with pytest.raises(ValueError, match=f"horizon must be .* or null, got {horizon}"):
             METRPO("inverted_pendulum", tiny(), horizon=horizon)  # type: ignore[arg-type]
+
+
+def test_a_copy_made_on_the_way_goes_on_by_itself() -> None:
+    algorithm = make()
+    rounds = algorithm.iterate()
+    next(rounds)
+    copy = deepcopy(algorithm)
+    expected = next(rounds).metrics
+    assert [result.metrics for result in copy.iterate()] == [expected]
+    assert copy.policy is not algorithm.policy
+    assert torch.equal(copy.policy.mean[0].weight, algorithm.policy.mean[0].weight)
