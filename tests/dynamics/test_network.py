@@ -128,6 +128,8 @@ def test_a_class_that_predicts_in_another_way_is_refused(form: type[EnsembleDyna
     class Renamed(form):  # type: ignore[misc, valid-type]
         """The same in all that it predicts."""
 
-    assert PlanningNetwork.from_dynamics(Renamed(3, 2, hidden=(4,))).members == 5
+    model = Renamed(3, 2, hidden=(4,))
+    for same in (model, torch.compile(model, backend="eager")):
+        assert PlanningNetwork.from_dynamics(same).members == 5
     with pytest.raises(TypeError, match="Periodic has a network_inputs of its own"):
         PlanningNetwork.from_dynamics(Periodic(3, 2, hidden=(4,)))

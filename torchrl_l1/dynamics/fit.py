@@ -228,7 +228,8 @@ def fit_ensemble(
             :func:`~torchrl_l1.dynamics.read_transitions` for what of them is used. The flag
             ``validation`` says what is kept out of training; without one trajectories are drawn.
         config: see :class:`FitConfig`.
-        optimizer: over ``dynamics.parameters()``; its moments persist between fits.
+        optimizer: over ``dynamics.parameters()``; its moments persist between fits, its step sizes
+            are those of ``config`` in all of its groups.
         action_key: ``"action"`` for the nominal label, ``"executed"`` for the executed one.
         on_epoch: called with the number of the finished epoch, for progress bars.
         observation_key: of the observation; ``("next", observation_key)`` is the one that followed.
