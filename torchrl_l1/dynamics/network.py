@@ -300,7 +300,7 @@ def _part(
     return found[:size].view(*shape)
 
 
-def _check_predicts_as_its_weights(kind: type[EnsembleDynamics]) -> None:
+def _check_predicts_as_its_weights(kind: type[Any]) -> None:
     """Refuse a class whose predictions a copy of weights and statistics does not know."""
     own = ControlAffineDynamics if issubclass(kind, ControlAffineDynamics) else EnsembleDynamics
     if not issubclass(kind, own):  # what torch.compile makes of one passes all on to it
