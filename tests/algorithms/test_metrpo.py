@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 
 import pytest
 import torch
@@ -199,3 +200,53 @@ def test_a_policy_of_ones_own_is_improved_by_autograd() -> None:
     reference = next(make(l1=None).iterate()).metrics
     assert metrics["trpo/kl"] == pytest.approx(reference["trpo/kl"], rel=0.05)
     assert metrics["trpo/accepted"] == reference["trpo/accepted"]
+
+
+def test_what_is_frozen_of_the_policy_stays() -> None:
+    algorithm = make(l1=None)
+    algorithm.policy.log_std.requires_grad_(False)
+    before = algorithm.policy.mean[0].weight.clone()
+    metrics = next(algorithm.iterate()).metrics
+    assert metrics["trpo/accepted"] == 1
+    assert algorithm.policy.log_std.tolist() == [0.0]
+    assert not torch.equal(algorithm.policy.mean[0].weight, before)
+
+
+def test_more_iterations_than_there_is_room_for_forget_no_data() -> None:
+    algorithm = make(l1=None, outer_iterations=1)
+    list(algorithm.iterate())
+    algorithm.config.outer_iterations = 2
+    with pytest.raises(ValueError, match=r"room for 150 items, not for 225.*state_dict"):
+        list(algorithm.iterate())
+    assert len(algorithm.learning.buffer) == 150
+    longer = make(l1=None, outer_iterations=2)
+    longer.load_state_dict(algorithm.state_dict())
+    assert [result.metrics["real_steps"] for result in longer.iterate()] == [225]
+
+
+def test_a_policy_of_another_type_is_refused_before_work_starts() -> None:
+    torch.set_default_dtype(torch.float64)
+    try:
+        with pytest.raises(ValueError, match="set_default_dtype"):
+            make(l1=None)
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+def test_numbers_of_steps_are_whole_and_there_are_some() -> None:
+    with pytest.raises(ValueError, match="imagined_steps must be an integer, got 200"):
+        tiny(imagined_steps=2e2)
+    for horizon in (0, -3, 25.0):
+        with pytest.raises(ValueError, match=f"horizon must be .* or null, got {horizon}"):
+            METRPO("inverted_pendulum", tiny(), horizon=horizon)  # type: ignore[arg-type]
+
+
+def test_a_copy_made_on_the_way_goes_on_by_itself() -> None:
+    algorithm = make()
+    rounds = algorithm.iterate()
+    next(rounds)
+    copy = deepcopy(algorithm)
+    expected = next(rounds).metrics
+    assert [result.metrics for result in copy.iterate()] == [expected]
+    assert copy.policy is not algorithm.policy
+    assert torch.equal(copy.policy.mean[0].weight, algorithm.policy.mean[0].weight)

@@ -17,6 +17,7 @@ from torchrl_l1.algorithms.pessimism import (
     halt,
     largest_deviation,
 )
+from torchrl_l1.algorithms.policy_improvement import imagined_advantages
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, GaussianHead
 
 N, M = 3, 2
@@ -219,3 +220,13 @@ def test_the_measure_follows_the_head() -> None:
     assert OfflineConfig(model=ModelConfig(head="gaussian")).measure == "deviation"
     both = OfflineConfig(model=ModelConfig(head="gaussian"), uncertainty="disagreement")
     assert both.measure == "disagreement"
+
+
+def test_rewards_that_are_no_numbers_beyond_a_halt_are_none_before_it() -> None:
+    imagined = trajectories(1, 4)
+    imagined["next", "reward"][0, 2] = torch.nan
+    unknown = torch.tensor([[False, True, False, False]])
+    changed = halt(imagined, unknown, -1.0, 0.9, bootstrap=False)
+    value = torch.zeros(1, 4, 1)
+    advantage, _ = imagined_advantages(changed, value, value[:, :1], 0.9, 0.8, "truncate")
+    assert advantage[0, :2].isfinite().all()

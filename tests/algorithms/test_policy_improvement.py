@@ -2,9 +2,23 @@ from __future__ import annotations
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from tensordict import TensorDict
+from torchrl.data import ReplayBuffer
 
-from torchrl_l1.algorithms.policy_improvement import _standardize, imagined_advantages
+from torchrl_l1.algorithms import METRPOConfig, Outcomes
+from torchrl_l1.algorithms.policy import GaussianPolicy
+from torchrl_l1.algorithms.policy_improvement import (
+    PolicyImprovement,
+    _standardize,
+    imagined_advantages,
+    spread_fisher,
+)
+from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.envs import get_task
+from torchrl_l1.objectives import TRPOConfig
+from torchrl_l1.objectives.trpo import fisher_stride
 
 GAMMA, LAMBDA = 0.9, 0.8
 
@@ -55,3 +69,28 @@ def test_a_single_sample_says_nothing() -> None:
     # All trajectories may leave the box at once, or there is one of one step.
     assert _standardize(torch.tensor([[3.0]])).item() == 0
     torch.testing.assert_close(_standardize(torch.tensor([[1.0], [3.0]])).std(), torch.tensor(1.0))
+
+
+@given(horizon=st.integers(1, 1000), fraction=st.floats(0.02, 1.0))
+def test_the_fisher_matrix_sees_more_than_the_first_steps(horizon: int, fraction: float) -> None:
+    config = TRPOConfig(fisher_fraction=fraction)
+    stride = fisher_stride(spread_fisher(config, horizon))
+    seen = {row % horizon for row in range(0, stride * horizon, stride)}
+    assert len(seen) >= min(horizon, 5)
+    assert fisher_stride(config) <= stride < fisher_stride(config) + 10
+    # Those of the recipes are what they were.
+    assert all(spread_fisher(TRPOConfig(), steps) == TRPOConfig() for steps in (50, 100, 200, 1000))
+
+
+def test_steps_are_of_a_length_that_few_backtracks_change() -> None:
+    torch.manual_seed(0)
+    config = METRPOConfig(trpo_iterations=1, imagined_steps=4000, imagined_horizon=10)
+    task, policy = get_task("hopper"), GaussianPolicy(11, 3, (32, 32))
+    model = EnsembleDynamics(11, 3, members=2, hidden=(16,))
+    # Away from where the task starts, as unstable systems go.
+    with torch.no_grad():
+        model.change_normalizer.std.fill_(0.3)
+    improvement = PolicyImprovement(task, model, policy, config, Outcomes(task))
+    reports = [improvement.step(ReplayBuffer()).report for _ in range(4)]
+    assert all(report.accepted for report in reports)
+    assert sum(report.backtracks for report in reports) <= 4

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from copy import deepcopy
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -365,3 +367,13 @@ def test_data_of_another_width_leave_the_model_alone() -> None:
     with pytest.raises(ValueError, match=r"takes observations of width 3 .* the data have 2 and 1"):
         fit_once(model, transitions(50), FitConfig())
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+
+
+def test_an_optimizer_of_another_model_is_refused() -> None:
+    data, model = transitions(50), EnsembleDynamics(2, 1, members=2, hidden=(8,))
+    copy, before = deepcopy(model), deepcopy(model.state_dict())
+    # What an optimizer was made for is not what a copy of it consists of: it would learn nothing.
+    with pytest.raises(ValueError, match="the optimizer holds no weights of this model"):
+        fit_ensemble(copy, data, FitConfig(), torch.optim.Adam(model.parameters()))
+    for name, value in copy.state_dict().items():
+        assert torch.equal(value, before[name])

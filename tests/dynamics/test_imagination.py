@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import CEMPlanner
+from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from torchrl_l1.dynamics import EnsembleDynamics, EnsembleModelEnv, imagine, make_dynamics
 
@@ -265,3 +266,73 @@ def test_entries_that_never_varied_end_nothing() -> None:
     assert data.shape == (4, 20) and (data["next", "observation"][..., 1] == 5).all()
     model.change_normalizer.mean[1] = torch.nan
     assert imagine(model, lambda o: o[:, :1], quadratic, x, 9, LOW, HIGH)["valid"].sum() == 50
+
+
+def test_what_is_no_number_per_row_is_named() -> None:
+    model, start = drifting_model(9.0), torch.zeros(3, 2)
+
+    def go(
+        reward: Callable[..., object] = reward,
+        terminated: Callable[[Tensor], object] | None = None,
+        start: Tensor = start,
+        horizon: int = 4,
+    ) -> None:
+        imagine(model, lambda x: x[:, :1], reward, start, horizon, LOW, HIGH, terminated)  # type: ignore[arg-type]
+
+    for wrong in (lambda *parts: parts[0][:, :1], lambda *parts: parts[0].mean(), lambda *parts: 1):
+        with pytest.raises(ValueError, match=r"the reward function must return shape"):
+            go(wrong)
+    with pytest.raises(ValueError, match=r"the terminated function must .* got \(12, 1\)"):
+        go(terminated=lambda successor: successor[:, :1] > 0)
+    with pytest.raises(ValueError, match=r"start must have shape \(B, 2\)"):
+        go(start=start[0])
+    with pytest.raises(ValueError, match="horizon must be at least 1"):
+        go(horizon=0)
+
+
+@pytest.mark.parametrize("value", [torch.nan, -torch.inf])
+def test_a_reward_that_is_no_number_after_the_end_is_none_before_it(value: float) -> None:
+    def breaks(x: Tensor, u: Tensor, successor: Tensor) -> Tensor:
+        return torch.where(successor[:, 0] > 2.5, value, successor[:, 0])
+
+    found = imagine(
+        drifting_model(100.0),
+        lambda x: torch.ones(1, 1),
+        breaks,
+        torch.zeros(1, 2),
+        5,
+        LOW,
+        HIGH,
+        lambda successor: successor[:, 0] > 1.5,
+    )
+    assert found["next", "reward"][0, :, 0].tolist() == [1.0, 2.0, 0.0, 0.0, 0.0]
+    advantage, _ = generalized_advantage_estimate(
+        0.5,
+        1.0,
+        torch.zeros(1, 5, 1),
+        torch.zeros(1, 5, 1),
+        *(found["next", key] for key in ("reward", "done", "terminated")),
+    )
+    assert advantage[0, :2, 0].tolist() == [2.0, 2.0]
+
+
+def test_the_environment_earns_what_imagination_does_where_it_ends() -> None:
+    def diverging(x: Tensor, u: Tensor, successor: Tensor) -> Tensor:
+        return torch.where(successor[..., 0] > 2.5, torch.nan, successor[..., 0])
+
+    model, ones = drifting_model(2.5), torch.ones(1, 1)
+    env = EnsembleModelEnv(model, diverging, lambda n: torch.zeros(n, 2), -1.0, 1.0, (1,))
+    data = env.rollout(9, lambda td: td.set("action", ones))
+    other = imagine(model, lambda x: ones, diverging, torch.zeros(1, 2), 3, LOW, HIGH)
+    assert data["next", "reward"][0, :, 0].tolist() == [1.0, 2.0, 2.0]
+    assert torch.equal(data["next", "reward"], other["next", "reward"])
+
+
+def test_bounds_of_each_entry_of_the_action() -> None:
+    model = EnsembleDynamics(2, 3, members=2, hidden=(4,))
+    low, high = torch.tensor([-1.0, 0.0, -5.0]), [1.0, 2.0, -4.0]
+    env = EnsembleModelEnv(model, reward, lambda n: torch.zeros(n, 2), low, high, (50,))
+    check_env_specs(env)
+    action = env.rollout(1)["action"]
+    for entry in range(3):
+        assert low[entry] <= action[..., entry].min() < action[..., entry].max() <= high[entry]

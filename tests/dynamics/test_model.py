@@ -163,3 +163,12 @@ def test_the_expansion_is_blind_to_what_was_not_selected() -> None:
     assert not remainder.any()
     for value in tangent_at(torch.zeros(4, 1, dtype=torch.bool)):
         assert value.isfinite().all()
+
+
+@pytest.mark.parametrize("kind", [torch.bool, torch.float32])
+def test_a_mask_of_elites_is_no_list_of_them(kind: torch.dtype) -> None:
+    model = EnsembleDynamics(3, 2, members=2, hidden=(4,))
+    for mask in (torch.tensor([1, 0]).to(kind), torch.tensor([1, 0]).to(kind).tolist()):
+        with pytest.raises(ValueError, match="must be indices of members"):
+            model.set_elites(mask)
+    assert model.elites.tolist() == [0, 1]

@@ -3,7 +3,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_l1.dynamics import EnsembleDynamics, make_dynamics, network
+from torchrl_l1.dynamics import (
+    ControlAffineDynamics,
+    EnsembleDynamics,
+    make_dynamics,
+    network,
+)
 from torchrl_l1.planning import PlanningNetwork, resolve_precision
 
 
@@ -111,3 +116,20 @@ def test_the_faster_product_is_found(monkeypatch):
     monkeypatch.setattr(network, "perf_counter", lambda: next(clock) * 1.0)
     assert not network._multiplies_bfloat16_faster()  # both take one tick
     network._multiplies_bfloat16_faster.cache_clear()
+
+
+@pytest.mark.parametrize("form", [EnsembleDynamics, ControlAffineDynamics])
+def test_a_class_that_predicts_in_another_way_is_refused(form: type[EnsembleDynamics]) -> None:
+    class Periodic(form):  # type: ignore[misc, valid-type]
+        def network_inputs(self, inputs: torch.Tensor) -> torch.Tensor:
+            read: torch.Tensor = super().network_inputs(inputs)
+            return read.sin()
+
+    class Renamed(form):  # type: ignore[misc, valid-type]
+        """The same in all that it predicts."""
+
+    model = Renamed(3, 2, hidden=(4,))
+    for same in (model, torch.compile(model, backend="eager")):
+        assert PlanningNetwork.from_dynamics(same).members == 5
+    with pytest.raises(TypeError, match="Periodic has a network_inputs of its own"):
+        PlanningNetwork.from_dynamics(Periodic(3, 2, hidden=(4,)))

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 
 import pytest
 import torch
@@ -184,3 +185,25 @@ def test_the_loss_of_a_chance_is_the_weighted_cross_entropy() -> None:
     ).div(5).backward()
     torch.testing.assert_close(gradient, leaf.grad)
     torch.testing.assert_close(head.standard_deviation(raw).double(), (p * (1 - p)).sqrt())
+
+
+@pytest.mark.parametrize("which", [RewardModel, TerminationModel])
+def test_what_does_not_fit_leaves_the_model_alone(
+    which: type[RewardModel] | type[TerminationModel],
+) -> None:
+    data = transitions(60)
+    widths = (3, 2) if which is RewardModel else (3,)
+    model, other = (which(*widths, hidden=(4,)) for _ in range(2))
+    before = deepcopy(model.state_dict())
+    own = torch.optim.Adam(model.parameters())
+    fit = fit_reward if which is RewardModel else fit_termination
+    for train, validation, config, optimizer, message in (
+        (data[:0], data[50:], FIT, own, "0 training and 10 validation"),
+        (data[:50], data[50:50], FIT, own, "50 training and 0 validation"),
+        (data[:50], data[50:], FitConfig(weight_decay=[1.0] * 5), own, "2 layers.* got 5"),
+        (data[:50], data[50:], FIT, torch.optim.Adam(other.parameters()), "no weights of this"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            fit(model, train, validation, config, optimizer)  # type: ignore[operator]
+    for name, value in model.state_dict().items():
+        assert torch.equal(value, before[name])

@@ -171,3 +171,15 @@ def test_a_missing_force_inflates_the_covariance():
     config = L1Config.robust(0.05, action_low=-1.0, action_high=1.0)
     found = calibrate_filter(residuals, lacking, data, config)
     assert found.inflation >= 8
+
+
+def test_a_table_in_double_precision_calibrates_a_model_in_single_precision():
+    torch.manual_seed(0)
+    model, data = EnsembleDynamics(1, 1, members=2, hidden=(4,)), episodes([400] * 2)
+    model.residuals.measure(one_step_residuals(model, data))
+    config = L1Config.robust(0.05, action_low=-1.0, action_high=1.0)
+    found = [
+        calibrate_filter(model.residuals, model.value_and_jacobian, rows, config)
+        for rows in (data.float(), data.float().double())
+    ]
+    assert found[0] == found[1] is not None

@@ -145,3 +145,14 @@ def test_other_networks_are_refused() -> None:
     x = torch.zeros(4, 3)
     with pytest.raises(ValueError, match="use trpo_step"):
         gaussian_trpo_step(nn.Sequential(linear, nn.ReLU(), linear), x[0], x, x, x, TRPOConfig())
+
+
+@pytest.mark.parametrize("name", ["mean.0.weight", "log_std"])
+def test_frozen_parameters_are_refused(name: str) -> None:
+    policy = GaussianPolicy(3, 2, (8,))
+    data = samples(policy, 40)
+    policy.get_parameter(name).requires_grad_(False)
+    before = parameters_to_vector(policy.parameters()).clone()
+    with pytest.raises(ValueError, match=f"{name.removeprefix('mean.')} is frozen; use trpo_step"):
+        closed_form_step(policy, data, TRPOConfig())
+    assert torch.equal(parameters_to_vector(policy.parameters()), before)

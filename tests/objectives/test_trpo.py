@@ -1,15 +1,18 @@
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torch.distributions import kl_divergence
+from tensordict.nn import TensorDictModule
+from torch.distributions import Normal, kl_divergence
 from torch.nn.utils import parameters_to_vector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import ProbabilisticActor
 
 from torchrl_l1.algorithms.policy import GaussianPolicy, make_actor
 from torchrl_l1.objectives import TRPOConfig, conjugate_gradient, gaussian_trpo_step, trpo_step
@@ -148,3 +151,51 @@ def test_a_step_all_of_whose_candidates_are_no_numbers_is_told(
     report = trpo_step(actor, data, TRPOConfig())
     assert not report.accepted and math.isnan(report.kl)
     assert torch.equal(parameters_to_vector(policy.parameters()), before)
+
+
+def test_a_density_per_entry_of_the_action_is_refused() -> None:
+    # Rows of densities and rows of advantages would make a table, and a step on its mean.
+    actor = ProbabilisticActor(
+        TensorDictModule(GaussianPolicy(3, 1, (4,)), ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=Normal,
+    )
+    data = batch(make_actor(GaussianPolicy(3, 1, (4,))))
+    before = parameters_to_vector(actor.parameters()).clone()
+    with pytest.raises(ValueError, match=r"Normal gives .* \(400, 1\) .* IndependentNormal"):
+        trpo_step(actor, data, TRPOConfig())
+    assert torch.equal(parameters_to_vector(actor.parameters()), before)
+
+
+def test_samples_that_carry_a_graph_are_samples_all_the_same() -> None:
+    torch.manual_seed(0)
+    policy = GaussianPolicy(3, 2, (4,), std=0.7)
+    data = TensorDict({"observation": torch.randn(400, 3)}, batch_size=[400])
+    with set_exploration_type(ExplorationType.RANDOM):
+        data = make_actor(policy)(data)  # drawn by reparametrisation
+    data["advantage"] = data["action"][:, :1] * data["observation"][:, :1]
+    assert data["action"].requires_grad
+    copy = deepcopy(policy)
+    expected = trpo_step(make_actor(copy), data.detach(), TRPOConfig())
+    assert trpo_step(make_actor(policy), data, TRPOConfig()) == expected
+    found, other = (parameters_to_vector(one.parameters()) for one in (policy, copy))
+    assert torch.equal(found, other)
+
+
+@pytest.mark.parametrize("closed_form", [False, True])
+def test_the_scale_of_the_advantages_does_not_matter(closed_form: bool) -> None:
+    torch.manual_seed(0)
+    start = GaussianPolicy(3, 2, (4,), std=0.7).double()
+    data = batch(make_actor(start.float())).double()
+    steps = []
+    for scale in (1.0, 1e-8):
+        policy, own = deepcopy(start).double(), data.clone()
+        own["advantage"] *= scale
+        if closed_form:
+            columns = (own[name] for name in ("observation", "action", "advantage"))
+            report = gaussian_trpo_step(policy.mean, policy.log_std, *columns, TRPOConfig())
+        else:
+            report = trpo_step(make_actor(policy), own, TRPOConfig())
+        assert report.accepted
+        steps.append(parameters_to_vector(policy.parameters()))
+    torch.testing.assert_close(*steps, rtol=1e-6, atol=1e-8)

@@ -405,3 +405,23 @@ def test_models_of_float64_are_planned_with_in_float32(propagation, common_noise
             torch.set_default_dtype(before)
     assert found[0].dtype == found[1].dtype == torch.float32
     torch.testing.assert_close(*found)
+
+
+def test_a_flag_of_any_type_ends_a_particle(linear):
+    model = linear([[[0.0]]], [[[1.0]]])
+    x, actions = torch.zeros(1, 1), torch.ones(1, 1, 4, 1)
+    for flag in (True, 1, 0.9):
+        found = evaluate(
+            model,
+            x,
+            actions,
+            lambda x, u, successor: successor[..., 0],
+            terminated=lambda successor, flag=flag: flag * (successor[..., 0] > 1.5),
+        )
+        assert found.item() == pytest.approx(3, abs=1e-3)
+
+
+def test_a_reward_that_is_no_tensor_is_named(linear):
+    model = linear([[[0.0]]], [[[1.0]]])
+    with pytest.raises(ValueError, match=r"the reward function must return shape .* got float"):
+        evaluate(model, torch.zeros(1, 1), torch.ones(1, 1, 4, 1), lambda x, u, successor: 1.0)

@@ -22,6 +22,7 @@ from torchrl_l1.algorithms.config import ModelConfig, episode_length
 from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.algorithms.model_learning import FIT_METRICS, ModelLearning, fit_metrics
 from torchrl_l1.algorithms.outcomes import OUTCOME_METRICS, OutcomeConfig, Outcomes
+from torchrl_l1.checks import check_optional_count
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import FitConfig, calibrate_filter, make_dynamics
@@ -196,6 +197,7 @@ class Algorithm(ABC):
         outcome_model: OutcomeConfig | None = None,
         search_path: Sequence[str] = (),
     ) -> None:
+        check_optional_count("horizon", horizon)
         self.config, self.l1, self.seed = config, l1, seed
         self.device = resolve_device(device)
         self.on_phase = on_phase or (lambda phase: None)
@@ -401,7 +403,10 @@ class Algorithm(ABC):
         return {"model": self.dynamics.state_dict(), **self.outcomes.weights()}
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to continue, as plain tensors and numbers."""
+        """Everything needed to continue, as plain tensors and numbers.
+
+        They are those in use, as in torch: ``copy.deepcopy`` what is to stay while this goes on.
+        """
         state = {"iteration": self.iteration, **self.learning.state_dict()}
         learned = self.outcomes.state_dict()
         return {**state, "outcomes": learned} if learned else state

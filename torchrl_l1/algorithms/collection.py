@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -125,6 +125,10 @@ class Collection:
         self._bare_env = partial(
             make_pipeline, task, episodes, perturbation, dynamics, None, horizon
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A running iterator cannot be copied, and needs not be: each call starts afresh.
+        return {name: part for name, part in vars(self).items() if name != "_policy_batches"}
 
     @cached_property
     def _policy_batches(self) -> Iterator[TensorDictBase]:

@@ -143,7 +143,7 @@ def check_improvement(settings: ImprovementConfig) -> None:
     resolve_precision(settings.precision)
     check_choice("label", settings.label, ("nominal", "executed"))
     check_choice("box_exit", settings.box_exit, ("truncate", "fail"))
-    check_counts(settings, "trpo_iterations", "imagined_horizon")
+    check_counts(settings, "trpo_iterations", "imagined_horizon", "imagined_steps")
     if not settings.imagined_steps >= settings.imagined_horizon:
         raise ValueError(
             f"imagined_steps ({settings.imagined_steps}) must hold at least one trajectory of "

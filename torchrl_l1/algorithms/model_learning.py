@@ -37,11 +37,21 @@ class TrainingData:
     """
 
     def __init__(self, capacity: int, batch_size: int, validation_fraction: float) -> None:
-        self.validation_fraction = validation_fraction
+        self.capacity, self.validation_fraction = capacity, validation_fraction
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(capacity), batch_size=batch_size)
 
     def extend(self, items: TensorDictBase) -> None:
-        """Add items ``[N]``, drawing for each whether it is kept out."""
+        """Add items ``[N]``, drawing for each whether it is kept out.
+
+        Raises:
+            ValueError: if there is no room for them: a buffer would forget the oldest ones.
+        """
+        count = len(self.buffer) + items.shape[0]
+        if count > self.capacity:
+            raise ValueError(
+                f"there is room for {self.capacity} items, not for {count}: where outer_iterations "
+                "was raised, make the algorithm anew with it and load this one's state_dict()"
+            )
         items["validation"] = torch.rand(items.shape[0]) < self.validation_fraction
         if items.shape[0]:
             self.buffer.extend(items)

@@ -247,6 +247,8 @@ def halt(
         worth[:-1] = halted_reward * powers.cumsum(0).flip(0)
     after = trajectories["next"]
     reward = after["reward"] + (halts * worth.to(after["reward"]))[..., None]
+    # What is no number after the end would be none before it, too: zero times it is none.
+    reward = torch.where(valid[..., None] | reward.isfinite(), reward, 0.0)
     return trajectories.update(
         {
             "valid": valid[..., None],

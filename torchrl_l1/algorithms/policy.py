@@ -208,7 +208,16 @@ def acting(policy: GaussianPolicy, task: AnyTask, clip: bool = True) -> TensorDi
         policy: shared, not copied.
         task: for the bounds.
         clip: whether to clip.
+
+    Raises:
+        ValueError: if the policy is not float32, as the observations of tasks are.
     """
+    kind = policy.log_std.dtype
+    if kind != torch.float32:
+        raise ValueError(
+            f"the policy is {kind}, but tasks give observations of torch.float32: call "
+            "torch.set_default_dtype(torch.float32) before it is made"
+        )
     low, high = task.action_low, task.action_high
     if not clip:
         return GaussianActor(policy)

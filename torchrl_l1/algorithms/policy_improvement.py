@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any
 
@@ -21,10 +21,12 @@ from torchrl_l1.dynamics import EnsembleDynamics, imagine
 from torchrl_l1.envs import AnyTask, StartStates, Task, action_bounds
 from torchrl_l1.objectives import (
     LinearFeatureBaseline,
+    TRPOConfig,
     TRPOReport,
     gaussian_trpo_step,
     trpo_step,
 )
+from torchrl_l1.objectives.trpo import fisher_stride
 
 POLICY_METRICS: dict[str, str] = {
     "imagined/return_first": "Mean imagined return before the first TRPO step.",
@@ -160,8 +162,9 @@ class PolicyImprovement:
         return self.task.terminated if own else None
 
     def _improve(self, observation: Tensor, action: Tensor, advantage: Tensor) -> TRPOReport:
-        policy, config = self.policy, self.config.trpo
-        if policy.is_plain:
+        policy = self.policy
+        config = spread_fisher(self.config.trpo, self.config.imagined_horizon)
+        if policy.is_plain and all(part.requires_grad for part in policy.parameters()):
             inputs = policy.normalizer.normalize(observation)
             return gaussian_trpo_step(
                 policy.mean, policy.log_std, inputs, action, advantage, config
@@ -209,6 +212,33 @@ def policy_metrics(steps: list[PolicyStep]) -> dict[str, float]:
         "trpo/improvement": fmean(report.improvement for report in reports),
         "trpo/accepted": fmean(report.accepted for report in reports),
     }
+
+
+# Different steps of each trajectory that the Fisher matrix is to be estimated on, at least.
+_LEAST_STEPS = 5
+
+
+def spread_fisher(config: TRPOConfig, horizon: int) -> TRPOConfig:
+    """Settings with which the Fisher matrix is estimated on all steps of short trajectories.
+
+    Samples stand trajectory by trajectory. Of trajectories of ten steps every tenth sample is a
+    first step, whose states are alike: the step length would be that of another policy.
+
+    Args:
+        config: settings.
+        horizon: steps of a trajectory.
+
+    Examples:
+        >>> [1 / spread_fisher(TRPOConfig(fisher_fraction=0.1), steps).fisher_fraction
+        ...  for steps in (1, 10, 20, 50)]
+        [10.0, 11.0, 11.0, 10.0]
+    """
+    stride = fisher_stride(config)
+    if horizon >= _LEAST_STEPS * stride:
+        return config
+    while math.gcd(stride, horizon) > 1:
+        stride += 1
+    return replace(config, fisher_fraction=1 / stride)
 
 
 def imagined_advantages(

@@ -228,7 +228,8 @@ def fit_ensemble(
             :func:`~torchrl_l1.dynamics.read_transitions` for what of them is used. The flag
             ``validation`` says what is kept out of training; without one trajectories are drawn.
         config: see :class:`FitConfig`.
-        optimizer: over ``dynamics.parameters()``; its moments persist between fits.
+        optimizer: over ``dynamics.parameters()``; its moments persist between fits, its step sizes
+            are those of ``config`` in all of its groups.
         action_key: ``"action"`` for the nominal label, ``"executed"`` for the executed one.
         on_epoch: called with the number of the finished epoch, for progress bars.
         observation_key: of the observation; ``("next", observation_key)`` is the one that followed.
@@ -344,6 +345,7 @@ def fit_to_transitions(
     words = ("fit", "transitions", "fit.validation_fraction")
     train, validation = two_parts(transitions.data, transitions.validation, *words)
     _check_widths(dynamics, train)
+    check_optimizer(optimizer, dynamics)
     dynamics.train()
     change = train["next", "observation"] - train["observation"]
     dynamics.fit_statistics(train["observation"], train["action"], change)
@@ -385,6 +387,7 @@ def train_members(
     Returns:
         validation losses of the weights that were kept ``(E,)``, and the report.
     """
+    own, shared = list(model.network.parameters()), list(model.head.parameters())
     training_step = TrainingStep(
         model,
         model_precision(model, config.precision),
@@ -394,7 +397,6 @@ def train_members(
     batch_size = min(config.batch_size, size)
     batches = size // batch_size
     best_loss = torch.full((members,), torch.inf, device=device)
-    own, shared = list(model.network.parameters()), list(model.head.parameters())
     best_own, best_shared = _copy(own), _copy(shared)
     resample = torch.randint(size, (members, size)).to(device) if config.bootstrap else None
     planned = min(config.max_epochs * batches, config.max_gradient_steps)
@@ -449,16 +451,33 @@ def _check_widths(dynamics: EnsembleDynamics, data: TensorDictBase) -> None:
         )
 
 
+def check_optimizer(optimizer: torch.optim.Optimizer, model: Members) -> None:
+    """Refuse one that would train nothing of the networks, such as that of their copy."""
+    known = {id(part) for group in optimizer.param_groups for part in group["params"]}
+    trained = [part for part in model.network.parameters() if part.requires_grad]
+    if trained and not any(id(part) in known for part in trained):
+        raise ValueError(
+            "the optimizer holds no weights of this model, maybe those of another or of what it "
+            "was copied from: make one over this model's parameters()"
+        )
+
+
 def check_fit(config: FitConfig, dynamics: EnsembleDynamics) -> None:
     """Refuse settings that do not fit the model, with a ``ValueError``."""
-    layers, members = len(dynamics.network.weights), dynamics.members
+    check_decay(config, dynamics)
+    members = dynamics.members
+    if config.elites is not None and config.elites > members:
+        raise ValueError(f"fit.elites is {config.elites}, but the model has {members} members")
+
+
+def check_decay(config: FitConfig, model: Members) -> None:
+    """Refuse coefficients for other layers than the model's, with a ``ValueError``."""
+    layers = len(model.network.weights)
     if config.weight_decay and len(config.weight_decay) != layers:
         raise ValueError(
             f"fit.weight_decay must hold a coefficient for each of the model's {layers} layers, "
             f"the output layer included, got {len(config.weight_decay)}"
         )
-    if config.elites is not None and config.elites > members:
-        raise ValueError(f"fit.elites is {config.elites}, but the model has {members} members")
 
 
 def _rows(data: Tensor, index: Tensor) -> Tensor:

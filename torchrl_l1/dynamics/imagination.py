@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
+from torchrl_l1.checks import check_count
 from torchrl_l1.dynamics.model import EnsembleDynamics
 from torchrl_l1.dynamics.network import ForwardPass, PlanningNetwork, Precision
 
@@ -56,10 +57,17 @@ def imagine(
         trajectories of batch size ``[B, T]`` with ``observation``, ``action``, ``step``
         ``(B, T, 1)``, ``valid`` ``(B, T, 1)`` (not ended before the step) and ``next``:
         ``observation``, ``reward``, ``done``, ``left_box`` and ``terminated``. What follows a
-        step that is ``done`` is not valid and means nothing.
+        step that is ``done`` is not valid and means nothing; its rewards are zero.
+
+    Raises:
+        ValueError: for no steps, start states of another shape, or a reward or termination that is
+            not one number per row.
     """
-    batch, device = start.shape[0], start.device
     n, m = dynamics.observation_dim, dynamics.action_dim
+    check_count("horizon", horizon)
+    if start.dim() != 2 or start.shape[1] != n:
+        raise ValueError(f"start must have shape (B, {n}) for this model, got {tuple(start.shape)}")
+    batch, device = start.shape[0], start.device
     network = PlanningNetwork.from_dynamics(dynamics, precision)
     drawn = torch.randint(network.members, (horizon,)).tolist()
     memory: dict[tuple[torch.dtype, int], Tensor] = {}
@@ -96,15 +104,18 @@ def imagine(
         observations[:-1].flatten(0, 1),
         actions.flatten(0, 1).clamp(action_low, action_high),
         successors,
-    ).to(start.dtype)
-    rewards = rewards.unflatten(0, (horizon, batch))
+    )
+    rewards = one_each(rewards, successors, "reward").to(start.dtype).unflatten(0, (horizon, batch))
     fallen = torch.zeros_like(inside)
     if terminated is not None:
-        fallen = terminated(successors).bool().unflatten(0, (horizon, batch))
+        fallen = one_each(terminated(successors), successors, "terminated").bool()
+        fallen = fallen.unflatten(0, (horizon, batch))
     ended = (~inside | fallen).long()
     valid = (ended.cumsum(0) - ended) == 0
     done = valid & ended.bool()
     left, fell = done & ~inside, done & inside
+    # Nothing is earned after the end: zero times what is no number would be none, too.
+    rewards = torch.where(valid, rewards, 0.0)
     done[-1] = True
     columns = {
         "observation": observations[:-1],
@@ -120,6 +131,21 @@ def imagine(
         },
     }
     return TensorDict(columns, batch_size=[horizon, batch]).transpose(0, 1)
+
+
+def one_each(values: Tensor, rows: Tensor, name: str) -> Tensor:
+    """What a reward or a termination gives, which must be ``(...)`` for rows ``(..., n)``.
+
+    Raises:
+        ValueError: naming the function.
+    """
+    found = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
+    if found != tuple(rows.shape[:-1]):
+        raise ValueError(
+            f"the {name} function must return shape (...) for inputs of shape (..., width), got "
+            f"{found} for inputs of shape {tuple(rows.shape[:-1])} + (width,)"
+        )
+    return values
 
 
 def _forward_pass(
@@ -174,9 +200,11 @@ class EnsembleWorldModel(TensorDictModuleBase):
             ).reshape(observation.shape)
         successor = self.dynamics.box.hold(observation, observation + change)
         left = ~self.dynamics.box.contains(successor).unsqueeze(-1)
+        # Outside, neither state nor reward mean anything.
+        successor = torch.where(left, observation, successor)
         return tensordict.update(
             {
-                "observation": torch.where(left, observation, successor),
+                "observation": successor,
                 "reward": self.reward(observation, action, successor).to(change).unsqueeze(-1),
                 "terminated": left,
                 "done": left,
@@ -187,15 +215,16 @@ class EnsembleWorldModel(TensorDictModuleBase):
 class EnsembleModelEnv(ModelBasedEnvBase):
     """A learned ensemble as an environment for TorchRL's rollouts, collectors and planners.
 
-    It terminates where the state leaves the box around the model's data. For the inner loop of
+    It terminates where the state leaves the box around the model's data, in the last one inside,
+    which the reward of that step is of. For the inner loop of
     an algorithm :func:`~torchrl_l1.dynamics.imagine` does the same faster.
 
     Args:
         dynamics: the ensemble.
         reward: maps observation, action and next observation to ``(...)``.
         start: draws initial observations, ``count -> (count, n)``.
-        action_low: lower bound of the actions.
-        action_high: upper bound of the actions.
+        action_low: lower bound of the actions, one number or one for each.
+        action_high: upper bound.
         batch_size: environments side by side; ``()`` for planners, which bring their own.
         propagation: see :class:`EnsembleWorldModel`.
 
@@ -218,8 +247,8 @@ class EnsembleModelEnv(ModelBasedEnvBase):
         dynamics: EnsembleDynamics,
         reward: RewardFunction,
         start: Callable[[int], Tensor],
-        action_low: float,
-        action_high: float,
+        action_low: float | Sequence[float] | Tensor,
+        action_high: float | Sequence[float] | Tensor,
         batch_size: tuple[int, ...] = (),
         propagation: str = "mean",
     ) -> None:
@@ -236,7 +265,11 @@ class EnsembleModelEnv(ModelBasedEnvBase):
             observation=Unbounded((*batch_size, n), **kind), shape=batch_size, device=device
         )
         self.state_spec = self.observation_spec.clone()
-        self.action_spec = Bounded(action_low, action_high, (*batch_size, m), **kind)
+        low, high = (
+            torch.as_tensor(bound, **kind).expand(*batch_size, m)
+            for bound in (action_low, action_high)
+        )
+        self.action_spec = Bounded(low, high, (*batch_size, m), **kind)
         self.reward_spec = Unbounded((*batch_size, 1), **kind)
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: object) -> TensorDict:

@@ -105,8 +105,11 @@ class EnsembleDynamics(nn.Module):
             index: indices of the members, in any order.
 
         Raises:
-            ValueError: if there is none, or one occurs twice or does not exist.
+            ValueError: if there is none, or one occurs twice or does not exist, or for a mask.
         """
+        kind = torch.as_tensor(index).dtype
+        if len(index) and (kind == torch.bool or kind.is_floating_point):
+            raise ValueError(f"elites must be indices of members, got numbers of {kind}")
         chosen = sorted(int(member) for member in index)
         if not chosen or len(set(chosen)) < len(chosen):
             raise ValueError(f"elites must be one member or more, each once, got {chosen}")

@@ -14,7 +14,11 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torchrl_l1.dynamics.control_affine import affine_coefficients, affine_output
+from torchrl_l1.dynamics.control_affine import (
+    ControlAffineDynamics,
+    affine_coefficients,
+    affine_output,
+)
 from torchrl_l1.dynamics.ensemble import ACTIVATIONS, ALIGNMENT
 from torchrl_l1.dynamics.heads import DeterministicHead
 from torchrl_l1.dynamics.model import EnsembleDynamics
@@ -24,6 +28,19 @@ Precision = Literal["auto", "float32", "bfloat16"]
 
 # Narrower products cost more to convert and to call than they save.
 _LEAST_WIDTH = 192
+
+# Methods that make predictions of weights and statistics.
+_PREDICTIONS = (
+    "normalize_inputs",
+    "network_inputs",
+    "raw",
+    "raw_member",
+    "raw_from_output",
+    "member_changes",
+    "member_change",
+    "mean_change",
+    "forward",
+)
 
 
 def resolve_precision(
@@ -131,8 +148,10 @@ class PlanningNetwork:
         """Copy the elites of an ensemble.
 
         Raises:
+            TypeError: for a class of one's own that predicts in another way.
             ValueError: for an unknown precision.
         """
+        _check_predicts_as_its_weights(type(dynamics))
         device = dynamics.change_normalizer.mean.device
         hidden = getattr(torch, model_precision(dynamics, precision))
         elites = dynamics.elites.to(device)
@@ -279,6 +298,19 @@ def _part(
     if found is None or found.numel() < size:
         found = memory[like.dtype, slot] = like.new_empty(size)
     return found[:size].view(*shape)
+
+
+def _check_predicts_as_its_weights(kind: type[Any]) -> None:
+    """Refuse a class whose predictions a copy of weights and statistics does not know."""
+    own = ControlAffineDynamics if issubclass(kind, ControlAffineDynamics) else EnsembleDynamics
+    if not issubclass(kind, own):  # what torch.compile makes of one passes all on to it
+        return
+    for name in _PREDICTIONS:
+        if getattr(kind, name) is not getattr(own, name):
+            raise TypeError(
+                f"{kind.__name__} has a {name} of its own, which planning and imagination, that "
+                f"copy the weights of an {own.__name__}, would pass over: use EnsembleModelEnv"
+            )
 
 
 def _fold_inputs(dynamics: EnsembleDynamics, weights: list[Tensor], biases: list[Tensor]) -> None:

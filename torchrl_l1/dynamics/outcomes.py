@@ -11,7 +11,13 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_l1.dynamics.ensemble import EnsembleMLP
-from torchrl_l1.dynamics.fit import FitConfig, FitReport, train_members
+from torchrl_l1.dynamics.fit import (
+    FitConfig,
+    FitReport,
+    check_decay,
+    check_optimizer,
+    train_members,
+)
 from torchrl_l1.dynamics.heads import BernoulliHead, DeterministicHead, Head
 from torchrl_l1.dynamics.normalizer import DataBox, Normalizer
 
@@ -224,6 +230,10 @@ def fit_reward(
         optimizer: over the model's parameters.
         action_key: of the action that earned the reward.
 
+    Raises:
+        ValueError: if there is nothing to train or to validate on, for decay of other layers, or an
+            optimizer of another model. The model is as it was then.
+
     Examples:
         >>> from tensordict import TensorDict
         >>> x, u = torch.randn(300, 2), torch.randn(300, 1)
@@ -234,6 +244,7 @@ def fit_reward(
         >>> fit_reward(model, data[:200], data[200:], FitConfig(), optimizer).fit.epochs > 0
         True
     """
+    _check(model, train, validation, config, optimizer)
     rows = [_transitions(model, part, action_key) for part in (train, validation)]
     rewards = [_column(model, part, "reward") for part in (train, validation)]
     normalizer = model.reward_normalizer
@@ -267,7 +278,11 @@ def fit_termination(
         validation: others, which say when to stop.
         config: as of the dynamics; shares of the data and elites do not matter.
         optimizer: over the model's parameters.
+
+    Raises:
+        ValueError: as :func:`fit_reward`.
     """
+    _check(model, train, validation, config, optimizer)
     rows = [_column(model, part, "observation") for part in (train, validation)]
     ends = [_column(model, part, "terminated") for part in (train, validation)]
     share = ends[0].mean().item()
@@ -288,6 +303,24 @@ def fit_termination(
         missed=missed.float().mean().item() if len(missed) else 0.0,
         false_alarms=alarms.float().mean().item() if len(alarms) else 0.0,
     )
+
+
+def _check(
+    model: OutcomeModel,
+    train: TensorDictBase,
+    validation: TensorDictBase,
+    config: FitConfig,
+    optimizer: torch.optim.Optimizer,
+) -> None:
+    """Refuse what no model can be fitted with."""
+    counts = train.shape[0], validation.shape[0]
+    if 0 in counts:
+        raise ValueError(
+            f"cannot fit a {type(model).__name__}: {counts[0]} training and {counts[1]} validation "
+            "transitions; collect more data or keep others out of training"
+        )
+    check_decay(config, model)
+    check_optimizer(optimizer, model)
 
 
 def _fit(

@@ -136,9 +136,13 @@ def calibrate_filter(
     rows = stretches(data)
     if rows is None:
         return None
-    observation, action = data["observation"][rows], data[action_key][rows]
+    # Tables are read in float64, models are mostly float32.
+    observation, action, following = (
+        data[key][rows].to(residuals.covariance)
+        for key in ("observation", action_key, ("next", "observation"))
+    )
     change, jacobian = value_and_jacobian(observation, action)
-    residual = data["next", "observation"][rows] - observation - change
+    residual = following - observation - change
     parts = (residual, jacobian, action)
     whole = torch.stack([part.isfinite().flatten(1).all(1) for part in parts]).all(0)
     if not whole.any():

@@ -20,6 +20,11 @@ def is_tanh_network(network: nn.Module) -> bool:
     )
 
 
+def is_frozen(parameter: Tensor) -> bool:
+    """Whether it is a parameter that is not to be trained; other tensors are none."""
+    return isinstance(parameter, nn.Parameter) and not parameter.requires_grad
+
+
 @torch.no_grad()
 def gaussian_trpo_step(
     mean: nn.Sequential,
@@ -42,6 +47,8 @@ def gaussian_trpo_step(
     forward and one back: the same numbers as by differentiating the KL divergence twice, up to
     rounding, in a fraction of the time.
 
+    All of them change: a policy of which some parameters are frozen takes :func:`trpo_step`.
+
     Args:
         mean: the network, see :func:`is_tanh_network`; changed in place.
         log_std: logarithm of the standard deviations ``(m,)``; changed in place.
@@ -51,7 +58,8 @@ def gaussian_trpo_step(
         config: see :class:`TRPOConfig`.
 
     Raises:
-        ValueError: if the advantages are not finite, or the network is of another kind.
+        ValueError: if the advantages are not finite, the network is of another kind, or a
+            parameter is frozen.
 
     Examples:
         >>> import torch
@@ -67,6 +75,12 @@ def gaussian_trpo_step(
     if not is_tanh_network(mean):
         raise ValueError(
             "gaussian_trpo_step takes linear layers with tanh in between; use trpo_step for others"
+        )
+    owned = {**dict(mean.named_parameters()), "log_std": log_std}
+    frozen = [name for name, part in owned.items() if is_frozen(part)]
+    if frozen:
+        raise ValueError(
+            f"gaussian_trpo_step changes all parameters, but {frozen[0]} is frozen; use trpo_step"
         )
     problem = _GaussianProblem(mean, log_std, inputs, action, advantage, config)
     return take_step(problem, advantage, config)

@@ -25,7 +25,8 @@ class TRPOConfig:
         max_kl: bound on the mean KL divergence between old and new policy, in nats.
         damping: multiple of the identity added to the Fisher matrix.
         cg_iterations: conjugate gradient iterations.
-        fisher_fraction: share of the samples on which the Fisher matrix is estimated.
+        fisher_fraction: share of the samples on which the Fisher matrix is estimated: every tenth,
+            for 0.1, in the order in which they are given, which must not repeat itself with them.
         backtrack_ratio: factor between successive line search candidates.
         max_backtracks: number of candidates tried.
         accept_ratio: least ratio of actual to predicted improvement of the surrogate.
@@ -70,14 +71,17 @@ def conjugate_gradient(
         matvec: ``v -> A v`` for vectors ``(d,)``.
         b: right-hand side ``(d,)``.
         iterations: at most this many products with ``A``.
-        tolerance: stop once the squared residual falls below it.
+        tolerance: stop once the squared residual falls to it, or to this share of that of ``b``
+            where ``b`` itself is as small.
     """
     x = torch.zeros_like(b)
     residual = b.clone()
     direction = b.clone()
     squared = residual @ residual
+    if squared < tolerance:
+        tolerance = tolerance * squared.item()
     for _ in range(iterations):
-        if squared < tolerance:
+        if squared <= tolerance:
             break
         product = matvec(direction)
         step = squared / (direction @ product)
@@ -128,7 +132,7 @@ def trpo_step(
         config: see :class:`TRPOConfig`.
 
     Raises:
-        ValueError: if the advantages are not finite.
+        ValueError: if the advantages are not finite, or if there is not one density per sample.
     """
     return take_step(_AutogradProblem(actor, data, config), data["advantage"], config)
 
@@ -189,11 +193,19 @@ class _AutogradProblem:
     def __init__(
         self, actor: ProbabilisticTensorDictSequential, data: TensorDictBase, config: TRPOConfig
     ) -> None:
+        data = data.detach()  # how samples were drawn is no part of the surrogate
         self.actor, self.data, self.config = actor, data, config
         self.parameters = [p for p in actor.parameters() if p.requires_grad]
         with torch.no_grad():
             self.old = actor.get_dist(data)
             self.old_log_prob = self.old.log_prob(data["action"])
+            wanted = data["advantage"].squeeze(-1).shape
+            if self.old_log_prob.shape != wanted:
+                raise ValueError(
+                    f"TRPO: the actor's {type(self.old).__name__} gives log-densities of shape "
+                    f"{tuple(self.old_log_prob.shape)} for advantages of {tuple(wanted)}: it must "
+                    "be one of whole actions, such as IndependentNormal of TorchRL"
+                )
             self.before = self._surrogate(self.old)
         self._divergence_gradient: Tensor | None = None
 

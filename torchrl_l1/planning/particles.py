@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torchrl_l1.dynamics.imagination import one_each
 from torchrl_l1.dynamics.network import ForwardPass, PlanningNetwork
 
 Scenarios = tuple[Tensor, Tensor]
@@ -161,12 +162,12 @@ def imagined_returns(
         torch.addcmul(states[t], change, network.change_std, out=states[t + 1])
         states[t + 1] += network.change_mean
     # Rewards may be integers or booleans: discounts and means are not.
-    rewards = _along(reward(states[:-1], u, states[1:]), u, "reward").to(u.dtype)
+    rewards = one_each(reward(states[:-1], u, states[1:]), u, "reward").to(u.dtype)
     if terminated is None:
         # A state that is not finite stays so: the last tells for all.
         sound = torch.isfinite(states[-1]).all(-1)
     else:
-        ended = _along(terminated(states[1:]), u, "terminated").long()
+        ended = one_each(terminated(states[1:]), u, "terminated").bool().long()
         over = (ended.cumsum(0) - ended) > 0
         rewards = torch.where(over, 0.0, rewards)
         sound = (torch.isfinite(states[1:]).all(-1) | over).all(0)
@@ -174,12 +175,3 @@ def imagined_returns(
         rewards = rewards * rewards.new_tensor([[discount**t] for t in range(horizon)])
     returns = rewards.sum(0)
     return torch.where(sound & torch.isfinite(returns), returns, -torch.inf)
-
-
-def _along(values: Tensor, u: Tensor, name: str) -> Tensor:
-    if values.shape != u.shape[:2]:
-        raise ValueError(
-            f"the {name} function must return shape (...) for inputs of shape (..., width), got "
-            f"{tuple(values.shape)} for inputs of shape {tuple(u.shape[:2])} + (width,)"
-        )
-    return values
