@@ -20,24 +20,7 @@ from torchrl_l1.dynamics import (
 )
 from torchrl_l1.dynamics.fit import fit_to_transitions
 
-
-def transitions(count: int, noise: float = 0.0) -> TensorDict:
-    """A known plant: x' = x + A x + B u, with constants in raw units of different scale."""
-    x = torch.randn(count, 2) * torch.tensor([1.0, 100.0])
-    u = torch.randn(count, 1)
-    change = x @ torch.tensor([[-0.1, 3.0], [0.001, -0.05]]) + u @ torch.tensor([[0.5, 20.0]])
-    change = change + noise * torch.randn_like(change)
-    held_out = torch.arange(count) % 5 == 0
-    return TensorDict(
-        {
-            "observation": x,
-            "action": u,
-            "executed": 2 * u,
-            "next": {"observation": x + change},
-            "validation": held_out,
-        },
-        batch_size=[count],
-    )
+from .conftest import transitions
 
 
 def fitted(action_key: str, config: FitConfig, data: TensorDict) -> EnsembleDynamics:
@@ -57,34 +40,6 @@ def test_learns_a_known_plant_and_the_label_that_is_asked_for(label: str, gain: 
     _, jacobian = model.value_and_jacobian(torch.zeros(1, 2), torch.zeros(1, 1))
     expected = gain * torch.tensor([[[0.5], [20.0]]])
     torch.testing.assert_close(jacobian, expected, rtol=0.1, atol=0.02)
-
-
-def test_loss_is_the_normalised_mean_squared_error_of_each_member() -> None:
-    torch.manual_seed(0)
-    data = transitions(30)
-    model = EnsembleDynamics(2, 1, members=3, hidden=(8,))
-    change = data["next", "observation"] - data["observation"]
-    model.fit_statistics(data["observation"], data["action"], change)
-    out = EnsembleDynamicsLoss(model)(data)
-    predicted = model.member_changes(data["observation"], data["action"])
-    std = model.change_normalizer.std
-    expected = (((predicted - change) / std) ** 2).mean((1, 2))
-    torch.testing.assert_close(out["member_loss"], expected, rtol=1e-4, atol=1e-6)
-    torch.testing.assert_close(out["loss_dynamics"], expected.sum(), rtol=1e-4, atol=1e-6)
-
-
-def test_members_do_not_share_gradients() -> None:
-    model = EnsembleDynamics(2, 1, members=2, hidden=(8,))
-    data = transitions(20)
-    per_member = torch.stack([data, data.clone()])
-    per_member["next", "observation"][1] = per_member["observation"][1]
-    model.fit_statistics(data["observation"], data["action"], torch.randn(20, 2))
-    loss = EnsembleDynamicsLoss(model)
-    loss(data)["loss_dynamics"].backward()
-    first_alone = model.network.weights[0].grad[0].clone()
-    model.zero_grad()
-    loss(per_member)["loss_dynamics"].backward()
-    torch.testing.assert_close(model.network.weights[0].grad[0], first_alone)
 
 
 def test_each_member_sees_its_own_shuffle() -> None:
@@ -107,51 +62,10 @@ def test_each_member_sees_its_own_shuffle() -> None:
     assert difference(160) < 1e-5  # all the training data in each batch
 
 
-class AbsoluteError(Head):
-    """A user's own head: the mean, and a column that is not used."""
-
-    def out_features(self, dim: int) -> int:
-        return dim + 1
-
-    def loss(self, raw: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        return (raw[..., :-1] - target).abs().sum(-1)
-
-    def standard_deviation(self, raw: torch.Tensor) -> torch.Tensor:
-        return torch.zeros_like(raw[..., :-1])
-
-
-def test_another_head_sets_width_and_loss() -> None:
-    torch.manual_seed(0)
-    model = EnsembleDynamics(2, 1, members=3, hidden=(8,), activation="tanh", head=AbsoluteError())
-    assert model.network.weights[-1].shape == (3, 8, 3)
-    data = transitions(30)
-    change = data["next", "observation"] - data["observation"]
-    model.fit_statistics(data["observation"], data["action"], change)
-    raw = model.network(model.normalize_inputs(data["observation"], data["action"]))
-    target = model.change_normalizer.normalize(change)
-    expected = (raw[..., :2] - target).abs().sum(-1).mean(-1)
-    out = EnsembleDynamicsLoss(model)(data)
-    torch.testing.assert_close(out["member_loss"], expected)
-    mean = model.change_normalizer.denormalize(raw[..., :2])
-    torch.testing.assert_close(model.member_changes(data["observation"], data["action"]), mean)
-    _, jacobian = model.value_and_jacobian(data["observation"], data["action"])
-    assert jacobian.shape == (30, 2, 1)
-
-
 @pytest.mark.parametrize("fraction", [0.0, 1.5])
 def test_the_learning_rate_never_rises(fraction: float) -> None:
     with pytest.raises(ValueError, match=r"final_learning_rate_fraction must be in \(0, 1\]"):
         FitConfig(final_learning_rate_fraction=fraction)
-
-
-def test_loss_keys_can_be_renamed_and_missing_ones_are_named() -> None:
-    model = EnsembleDynamics(2, 1, members=2, hidden=(8,))
-    loss = EnsembleDynamicsLoss(model)
-    loss.set_keys(action="executed")
-    data = transitions(5)
-    assert torch.isfinite(loss(data)["loss_dynamics"])
-    with pytest.raises(KeyError, match="executed"):
-        loss(data.exclude("executed"))
 
 
 def test_gradient_steps_are_bounded_and_best_weights_are_kept() -> None:

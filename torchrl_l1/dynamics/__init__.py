@@ -5,10 +5,8 @@ from torchrl_l1.dynamics.data import read_csv, read_minari, read_npz
 from torchrl_l1.dynamics.ensemble import EnsembleMLP
 from torchrl_l1.dynamics.factory import MODEL_FORMS, make_dynamics, matched_hidden
 from torchrl_l1.dynamics.fit import (
-    EnsembleDynamicsLoss,
     FitConfig,
     FitReport,
-    evaluate_members,
     fit_dynamics,
     fit_ensemble,
 )
@@ -21,6 +19,7 @@ from torchrl_l1.dynamics.heads import (
     make_head,
 )
 from torchrl_l1.dynamics.imagination import EnsembleModelEnv, EnsembleWorldModel, imagine
+from torchrl_l1.dynamics.loss import EnsembleDynamicsLoss, evaluate_members
 from torchrl_l1.dynamics.model import EnsembleDynamics
 from torchrl_l1.dynamics.normalizer import DataBox, Normalizer
 from torchrl_l1.dynamics.outcomes import (
