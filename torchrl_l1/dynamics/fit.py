@@ -207,6 +207,8 @@ def fit_dynamics(
         ValueError: if the data do not suffice, or for shapes or settings that make no sense.
 
     Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
         >>> x, u = torch.randn(500, 2, dtype=torch.float64), torch.randn(500, 1)
         >>> data = TensorDict({"observation": x, "action": u}, batch_size=[500])
         >>> data["next", "observation"] = 0.9 * x + 0.1 * u
