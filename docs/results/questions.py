@@ -10,6 +10,7 @@ their pages write, and the paper's table. Writes `questions/table1.md` and `.png
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -47,7 +48,8 @@ class Found(NamedTuple):
 
     Attributes:
         edition: the folder that they are from.
-        off: mean return without L1; empty if there are no runs.
+        off: mean return without L1, of the seeds in pairs where there are pairs; empty if there
+            are no runs.
         on: mean return with the controller in training, likewise.
         pair: paired differences between the two, if there are any.
     """
@@ -89,11 +91,25 @@ def ours(task: str, noise: str, l1: str) -> Found | None:
             and row["policy"] == "stochastic"
             and int(row["pairs"])
         ]
+        for arm in ("off", l1) if pair else ():
+            returns[arm] = str(mean_return(edition, (task, noise, arm), pair[0]["seeds"].split()))
         on = returns.get(l1, "")
         found = Found(edition, returns.get("off", ""), on, pair[0] if pair else None)
         if found.off and (best is None or found.pairs >= best.pairs):
             best = found
     return best
+
+
+def mean_return(edition: str, cell: tuple[str, str, str], seeds: Sequence[str]) -> float:
+    """Mean over the runs of a cell that have these seeds."""
+    found = [
+        float(row["return"])
+        for row in rows(edition, "runs.csv")
+        if (row["task"], row["noise"], row["l1"]) == cell and not row["variant"]
+        if row["return"] and row["seed"] in seeds
+    ]
+    assert len(found) == len(seeds), (edition, cell, seeds)
+    return float(np.mean(found))
 
 
 def draw(ax: Axes, pair: Row, row: float, scale: float, color: str) -> None:
