@@ -54,6 +54,8 @@ def main() -> None:
         # Another user must get to what that user may not write.
         Path(root).chmod(0o755)
         rows = attack(Path(root), options.quick, options.seed, options.only, options.match)
+    if not any(row.tried for row in rows):
+        parser.error(f"nothing has {options.match!r} in its name there")
     print(table(rows))
     sys.exit(any(row.failures for row in rows))
 

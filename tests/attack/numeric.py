@@ -269,8 +269,8 @@ def spoil_simulation(what: str, value: float, at: int) -> None:
         return
     step = simulation.TaskSimulation.step
 
-    def spoilt(self: simulation.TaskSimulation, action: Tensor) -> Any:
-        reward, terminated, bad = step(self, action)
+    def spoilt(self: simulation.TaskSimulation, *arguments: Any) -> Any:
+        reward, terminated, bad = step(self, *arguments)
         if next(count) % 50 == at:
             reward = reward.clone()
             reward[0] = value
@@ -301,15 +301,16 @@ class Spoilt:
 
 
 def ways() -> list[Spoilt]:
+    """All of them; the quick attack tries the first two."""
     nan, inf = math.nan, math.inf
     return [
         Spoilt("weights of nan", partial(spoil_weights, nan, 1)),
+        Spoilt("reward of nan", partial(spoil_simulation, "reward", nan, 3)),
         Spoilt("weights of inf", partial(spoil_weights, inf, 1)),
         Spoilt("weights of 1e30", partial(spoil_weights, 1e30, 1)),
         Spoilt("loss of inf", partial(spoil_loss, inf, 1)),
         Spoilt("loss of nan", partial(spoil_loss, nan, 0)),
         Spoilt("learning rate of 1e30", None, ("fit.learning_rate=1e30",), surely=False),
-        Spoilt("reward of nan", partial(spoil_simulation, "reward", nan, 3)),
         Spoilt("reward of inf", partial(spoil_simulation, "reward", inf, 3)),
         Spoilt("state of nan", partial(spoil_simulation, "state", nan, 3), surely=False),
         Spoilt("state of 1e30", partial(spoil_simulation, "state", 1e30, 3), surely=False),
