@@ -251,6 +251,23 @@ def test_what_chance_makes_of_a_single_seed_is_quoted() -> None:
         assert all(value in text for value in (*returns, added)), page
 
 
+def test_what_observation_noise_costs_the_pendulum_is_quoted() -> None:
+    cell = second_edition("inverted_pendulum", "observation")
+    with (RESULTS / "table1/pairs.csv").open(newline="") as handle:
+        pairs = {
+            row["l1"]: [float(one) for one in row["differences"].split()]
+            for row in csv.DictReader(handle)
+            if (row["task"], row["noise"]) == ("inverted_pendulum", "observation")
+            and row["policy"] == "stochastic"
+        }
+    text = " ".join((ROOT / "docs/studies/table1.md").read_text().split())
+    off, on = (float(cell[arm]["return_mean"]) for arm in ("off", "paper"))
+    assert f"in both pairs of the second edition, {off:.1f} against {on:.1f}" in text
+    assert len(pairs["paper"]) == 2 and max(pairs["paper"]) < 0
+    gain, loss = pairs["robust"]
+    assert f"one gains {gain:.1f} and the other loses {-loss:.1f} with it" in text
+
+
 def test_counts_of_pairs_are_those_of_the_table() -> None:
     counts = {
         row["L1 in training"]: (row["all"], row["share"])
