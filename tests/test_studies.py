@@ -263,6 +263,15 @@ def test_what_observation_noise_costs_the_pendulum_is_quoted() -> None:
     text = " ".join((ROOT / "docs/studies/table1.md").read_text().split())
     off, on = (float(cell[arm]["return_mean"]) for arm in ("off", "paper"))
     assert f"in both pairs of the second edition, {off:.1f} against {on:.1f}" in text
+    curves: dict[tuple[str, str], list[float]] = {}
+    with (RESULTS / "table1/learning_curves.csv").open(newline="") as handle:
+        for row in csv.DictReader(handle):
+            if (row["task"], row["noise"]) == ("inverted_pendulum", "observation"):
+                curves.setdefault((row["l1"], row["seed"]), []).append(float(row["return"]))
+    late = {run: f"{sum(found[-10:]) / 10:.1f}" for run, found in curves.items()}
+    one, other = ((late["off", seed], late["paper", seed]) for seed in ("0", "1"))
+    words = f"one pair is even, {one[0]} and {one[1]}, the other {other[0]} against {other[1]}"
+    assert words in text
     assert len(pairs["paper"]) == 2 and max(pairs["paper"]) < 0
     gain, loss = pairs["robust"]
     assert f"one gains {gain:.1f} and the other loses {-loss:.1f} with it" in text
