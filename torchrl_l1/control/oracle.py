@@ -20,6 +20,7 @@ from torchrl.envs.transforms import (
 
 from torchrl_l1.control.controller import L1Primer
 from torchrl_l1.control.layout import L1_KEY, entry_name, required_entry
+from torchrl_l1.control.pipeline import transforms_of
 from torchrl_l1.control.transform import L1Transform
 
 
@@ -152,7 +153,7 @@ class OracleTransform(Transform):
         is traced back from the first transform, of the innermost environment.
         """
         undone = ""
-        for transform in _transforms(self._environment()):
+        for transform in transforms_of(self._environment()):
             if transform is self:
                 return
             compensate = getattr(transform, "compensate", None)
@@ -168,7 +169,7 @@ class OracleTransform(Transform):
 
     def _check_surroundings(self) -> None:
         environment = self._environment()
-        for transform in _transforms(environment):
+        for transform in transforms_of(environment):
             is_controller = isinstance(transform, (L1Primer, L1Transform, OracleTransform))
             is_other = is_controller and transform is not self
             if is_other and self._is_of_this_action(transform, "action_key"):
@@ -179,7 +180,7 @@ class OracleTransform(Transform):
         while isinstance(environment, TransformedEnv):
             environment = environment.base_env
         members = environment.__dict__.get("_envs", []) if type(environment) is SerialEnv else []
-        for transform in (inner for member in members for inner in _transforms(member)):
+        for transform in (inner for member in members for inner in transforms_of(member)):
             disturbs = callable(getattr(transform, "compensate", None))
             if disturbs and self._is_of_this_action(transform, "key"):
                 name = type(transform).__name__
@@ -200,12 +201,3 @@ class OracleTransform(Transform):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(key={self.key!r})"
-
-
-def _transforms(environment: EnvBase) -> list[nn.Module]:
-    """All transforms of an environment, those of environments inside first."""
-    chains = []
-    while isinstance(environment, TransformedEnv):
-        chains.append(environment.transform)
-        environment = environment.base_env
-    return [member for chain in reversed(chains) for member in chain.modules()]

@@ -10,6 +10,7 @@ from typing import Any
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
+from torch import nn
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import EnvBase, PendulumEnv, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import (
@@ -49,6 +50,15 @@ def _flatten(transform: Transform) -> Iterator[Transform]:
             yield from _flatten(member)
     else:
         yield transform
+
+
+def transforms_of(environment: EnvBase) -> list[nn.Module]:
+    """All transforms of an environment, in order, those of environments inside it first."""
+    chains = []
+    while isinstance(environment, TransformedEnv):
+        chains.append(environment.transform)
+        environment = environment.base_env
+    return [member for chain in reversed(chains) for member in chain.modules()]
 
 
 def check_order(

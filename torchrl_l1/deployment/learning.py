@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -17,13 +17,13 @@ from torchrl.envs import (
     InitTracker,
     TensorDictPrimer,
     Transform,
-    TransformedEnv,
 )
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.utils import get_primers_from_module
 
 from torchrl_l1.algorithms.collection import seed_streams, stream_seed
 from torchrl_l1.control import L1Primer, L1Transform, OracleTransform
+from torchrl_l1.control.pipeline import transforms_of
 from torchrl_l1.dynamics import EnsembleDynamics, read_transitions
 from torchrl_l1.envs import EnvironmentSource
 
@@ -33,8 +33,6 @@ FEW_OBSERVATIONS = 5
 _MEAN_HOLD = 10
 
 _ROWS = 10  # recorded steps are laid side by side in so many
-
-
 _ROUNDING = 1e-5  # of a bound
 
 
@@ -216,7 +214,7 @@ def check_surroundings(env: EnvBase) -> None:
     Raises:
         ValueError: naming it.
     """
-    for transform in _transforms(env):
+    for transform in transforms_of(env):
         if isinstance(transform, (L1Primer, L1Transform, OracleTransform)):
             raise ValueError(
                 f"the environment brings {type(transform).__name__} along, beside which another "
@@ -226,7 +224,7 @@ def check_surroundings(env: EnvBase) -> None:
 
 def warn_of_disturbances(env: EnvBase) -> None:
     """Data are to be of the undisturbed plant: a bias in them is nominal to the model."""
-    for transform in _transforms(env):
+    for transform in transforms_of(env):
         if callable(getattr(transform, "compensate", None)):
             warnings.warn(
                 f"the environment brings {type(transform).__name__} along: the model takes "
@@ -234,12 +232,6 @@ def warn_of_disturbances(env: EnvBase) -> None:
                 "environment, and evaluate the disturbances",
                 stacklevel=3,
             )
-
-
-def _transforms(env: EnvBase) -> Iterator[torch.nn.Module]:
-    while isinstance(env, TransformedEnv):
-        yield from env.transform.modules()
-        env = env.base_env
 
 
 def agreed_time_step(source: EnvironmentSource, dt: float | None) -> float:

@@ -18,9 +18,7 @@ from torchrl_l1.atomic import write_atomically
 from torchrl_l1.checks import check_choice, check_count
 from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.deployment.assessment import Assessment, Disturbances, assess
-from torchrl_l1.deployment.learning import (
-    policy_transforms,
-)
+from torchrl_l1.deployment.learning import policy_transforms
 from torchrl_l1.deployment.policies import Policy, load_policy
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.envs import EnvironmentSource, environment_source, vector_environment

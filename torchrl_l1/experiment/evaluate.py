@@ -107,10 +107,10 @@ def load_run(path: str | Path, *, last: bool = False) -> TrainedRun:
     here: dict[str, Any] = {"device": "cpu"}
     if hasattr(recipe, "compile_plans"):
         here["compile_plans"] = False  # as "auto" decides on the CPU
-    with fitting_into_memory(str(path)), single_precision():
-        algorithm = replace(recipe, **here).build()
     state = checkpoint["algorithm"]
     with single_precision():
+        with fitting_into_memory(str(path)):
+            algorithm = replace(recipe, **here).build()
         load_state(algorithm, {**state, "buffer": {}}, directory.checkpoint_file)
         _measure_residuals(algorithm, state.get("buffer", {}), recipe)
     return TrainedRun(directory.path, recipe, algorithm, Path(path).stem if kept else "")

@@ -171,7 +171,7 @@ def _composed(name: str | None, overrides: list[str]) -> DictConfig:
 
 def _spelled_out(recipe: Path, overrides: Sequence[str]) -> list[str]:
     """Overrides with the options that a glob matches: Hydra knows those beside the recipe only."""
-    folders = [recipe.parent, shared_dir(), *_folders(recipe)]
+    folders = _group_folders(recipe)
     found = []
     for text in overrides:
         key, _, value = text.partition("=")
@@ -362,7 +362,7 @@ def _search_path(recipe: Path) -> list[str]:
 
 def _check_options(recipe: Path, overrides: Sequence[str]) -> None:
     """Refuse several options of a group in one run: the last one would count, and none is told."""
-    folders = [recipe.parent, shared_dir(), *_folders(recipe)]
+    folders = _group_folders(recipe)
     for text in overrides:
         key, _, value = text.lstrip("+").partition("=")
         several = value.strip().removeprefix("[").removesuffix("]")
@@ -375,6 +375,11 @@ def _check_options(recipe: Path, overrides: Sequence[str]) -> None:
                 f"{text}: a run has one {key}; -m {key}={several.replace(' ', '')} makes a run of "
                 "each, and so does a campaign's matrix"
             )
+
+
+def _group_folders(recipe: Path) -> list[Path]:
+    """Where the groups of a recipe are: beside it, shared ones, those of its algorithms."""
+    return [recipe.parent, shared_dir(), *_folders(recipe)]
 
 
 def _folders(recipe: Path) -> list[Path]:
