@@ -122,16 +122,19 @@ def test_first_sentences_of_the_study_quote_the_table() -> None:
     assert f"at worst {-worst:.1f} % lower" in " ".join(first.split())
 
 
+@pytest.mark.parametrize("algorithm", ["METRPO", "MBMF"])
 def test_table_of_the_paper_is_that_of_the_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     questions = script("questions", monkeypatch)
     monkeypatch.setattr(questions, "HERE", tmp_path)
-    questions.table1()
-    written = (tmp_path / "table1.md").read_text()
-    assert written == (RESULTS / "questions/table1.md").read_text()
+    table = getattr(questions, algorithm)
+    questions.cells_of(table)
+    name = f"table{table.number}.md"
+    written = (tmp_path / name).read_text()
+    assert written == (RESULTS / "questions" / name).read_text()
     cells = rows(written)
-    assert len(cells) == 2 * 15
+    assert len(cells) == len(table.arms) * 15
     checked = 0
     for row in cells:
         for pair in pairs(row["runs of"]):
@@ -163,7 +166,7 @@ def test_cells_are_of_the_edition_with_most_pairs(
     many: tuple[int, int, int], expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     questions = script("questions", monkeypatch)
-    pairs_of = dict(zip(questions.EDITIONS, many, strict=True))
+    pairs_of = dict(zip(questions.METRPO.editions, many, strict=True))
 
     def rows_of(edition: str, name: str) -> list[dict[str, str]]:
         key = {"task": "swimmer", "noise": "none"}
@@ -183,11 +186,11 @@ def test_cells_are_of_the_edition_with_most_pairs(
         return [key | {"l1": "paper", "policy": "stochastic"} | counted]
 
     monkeypatch.setattr(questions, "rows", rows_of)
-    found = questions.ours("swimmer", "none", "paper")
+    found = questions.ours(questions.METRPO, "swimmer", "none", "paper")
     assert (found.edition, found.pairs) == (expected, max(many))
     assert (float(found.off), found.on) == ((1.5, "2.5") if max(many) else (7.0, ""))
-    assert questions.ours("swimmer", "none", "robust").pair is None
-    assert questions.ours("swimmer", "action", "paper") is None
+    assert questions.ours(questions.METRPO, "swimmer", "none", "robust").pair is None
+    assert questions.ours(questions.METRPO, "swimmer", "action", "paper") is None
 
 
 def test_index_quotes_the_tables() -> None:
@@ -279,14 +282,14 @@ def test_what_observation_noise_costs_the_pendulum_is_quoted() -> None:
 
 def test_counts_of_pairs_are_those_of_the_table() -> None:
     counts = {
-        row["L1 in training"]: (row["all"], row["share"])
+        (row["algorithm"], row["L1 in training"]): (row["all"], row["share"])
         for row in rows((RESULTS / "questions/ahead.md").read_text())
     }
     text = " ".join((ROOT / "docs/studies/index.md").read_text().split())
-    for l1, (count, share) in counts.items():
+    for arm, (count, share) in counts.items():
         ahead, pairs = count.split(" of ")
-        assert f"{ahead} of {pairs} pairs" in text, l1
-        assert share in text, l1
+        assert f"{ahead} of {pairs} pairs" in text, arm
+        assert share in text, arm
 
 
 def test_what_a_controller_that_hardly_acts_changes_is_quoted() -> None:

@@ -2,9 +2,9 @@
 
     python docs/results/questions.py
 
-Reads `baselines/`, `table1_first/`, `table1/` and `robust/` beside this file, which the commands of
-their pages write, and the paper's table. Writes `questions/table1.md` and `.png`,
-`questions/ahead.md`, and `questions/recovered.md` and `.png`.
+Reads `baselines/`, `table1_first/`, `table1/`, `mbmf/` and `robust/` beside this file, which the
+commands of their pages write, and the paper's tables. Writes to `questions/`: `table1.md` and
+`table4.md` with a `.png` of each, `ahead.md`, and `recovered.md` and `.png`.
 """
 
 from __future__ import annotations
@@ -26,8 +26,6 @@ from torchrl_l1.report.published import published_cells
 from torchrl_l1.report.style import color as color_of
 
 HERE = Path(__file__).with_name("questions")
-# Reports of runs, the earliest first.
-EDITIONS = ("baselines", "table1_first", "table1")
 NOISES = ("none", "action", "observation")
 # Differences are drawn as shares of these returns: of the pendulum that of a pole that hangs.
 SCALES = {
@@ -37,10 +35,30 @@ SCALES = {
     "walker": 800.0,
     "half_cheetah": 3270.0,
 }
-# Controllers in training: place beside the line of a cell.
-ARMS = {"paper": -0.16, "robust": 0.16}
 ENDS = ("difference_low", "difference_high")
 Row = dict[str, str]
+
+
+class Table(NamedTuple):
+    """A table of the paper.
+
+    Attributes:
+        number: the paper's.
+        algorithm: the one that its rows are about.
+        editions: reports of our runs, the earliest first.
+        arms: controllers in training, and the place of each beside the line of a cell.
+    """
+
+    number: str
+    algorithm: str
+    editions: tuple[str, ...]
+    arms: dict[str, float]
+
+
+METRPO = Table(
+    "1", "METRPO", ("baselines", "table1_first", "table1"), {"paper": -0.16, "robust": 0.16}
+)
+MBMF = Table("4", "MBMF", ("mbmf",), {"paper": 0.0})
 
 
 class Found(NamedTuple):
@@ -75,10 +93,10 @@ def rows(folder: str, name: str) -> list[Row]:
         return list(csv.DictReader(handle))
 
 
-def ours(task: str, noise: str, l1: str) -> Found | None:
-    """Of the editions that have the cell the one with most pairs, or the latest of these."""
+def ours(table: Table, task: str, noise: str, l1: str) -> Found | None:
+    """Of a table's editions that have the cell the one with most pairs, or the latest of these."""
     best = None
-    for edition in EDITIONS:
+    for edition in table.editions:
         returns = {
             row["l1"]: row["return_mean"]
             for row in rows(edition, "training.csv")
@@ -125,8 +143,8 @@ def draw(ax: Axes, pair: Row, row: float, scale: float, color: str) -> None:
         ax.plot(ends / scale, [row, row], color=color, lw=1)
 
 
-def line(task: str, noise: str, l1: str, found: Found | None) -> Row:
-    """A cell in the table."""
+def line(table: Table, task: str, noise: str, l1: str, found: Found | None) -> Row:
+    """A cell in a table."""
     words = {"task": task, "noise": noise, "L1": l1, "off": "not run", "on": "not run"}
     words |= {"difference": "", "95 % interval": "", "pairs": "0"}
     if found is not None:
@@ -138,7 +156,7 @@ def line(task: str, noise: str, l1: str, found: Found | None) -> Row:
             if found.pair.get("difference_low"):
                 ends = {name: float(found.pair[name]) for name in ENDS}
                 words["95 % interval"] = interval_text(ends, "difference")
-    off, on = (published_cells()["1", task, noise, arm, arm] for arm in ("off", "on"))
+    off, on = (published_cells()[table.number, task, noise, arm, arm] for arm in ("off", "on"))
     words |= dict.fromkeys(("published off", "published on", "its difference"), "")
     if l1 == "paper":
         words |= {"published off": off.mean, "published on": on.mean}
@@ -147,17 +165,17 @@ def line(task: str, noise: str, l1: str, found: Found | None) -> Row:
     return words
 
 
-def table1() -> None:
-    """All cells of Table 1: ours where there are runs, beside the paper's."""
+def cells_of(table: Table) -> None:
+    """All cells of a table: ours where there are runs, beside the paper's."""
     HERE.mkdir(exist_ok=True)
     lines, labels = [], []
     figure, ax = plt.subplots(figsize=(8, 6.4), layout="constrained")
     cells = [(task, noise) for task in SCALES for noise in NOISES]
     for place, (task, noise) in enumerate(cells):
         run, scale = False, SCALES[task]
-        for l1, offset in ARMS.items():
-            found = ours(task, noise, l1)
-            lines.append(line(task, noise, l1, found))
+        for l1, offset in table.arms.items():
+            found = ours(table, task, noise, l1)
+            lines.append(line(table, task, noise, l1, found))
             if theirs := lines[-1]["its difference"]:
                 ax.plot(float(theirs) / scale, place, "o", color="0.6")
             if found is not None and found.pair is not None:
@@ -169,15 +187,15 @@ def table1() -> None:
     ax.set_yticks(range(len(cells)), labels)
     ax.set_xlabel("return with L1 in training less that without, as a share of the task's scale")
     ax.plot([], [], "o", color="0.6", label="published")
-    for l1 in ARMS:
+    for l1 in table.arms:
         label = f"ours, {l1}: mean, interval, seeds"
         ax.plot([], [], "D-", color=color_of(0, l1), markersize=4, label=label)
     single = {"color": "0.3", "markersize": 4, "markerfacecolor": "white"}
     ax.plot([], [], "D", **single, label="hollow: a single seed")
     figure.legend(loc="outside lower center", ncols=2)
-    figure.savefig(HERE / "table1.png", dpi=110)
+    figure.savefig(HERE / f"table{table.number}.png", dpi=110)
     plt.close(figure)
-    (HERE / "table1.md").write_text(markdown(lines) + "\n")
+    (HERE / f"table{table.number}.md").write_text(markdown(lines) + "\n")
 
 
 def ahead() -> None:
@@ -187,11 +205,11 @@ def ahead() -> None:
     """
     groups = ["all", *(task.replace("_", " ") for task in SCALES), *map("noise {}".format, NOISES)]
     lines = []
-    for l1 in ARMS:
+    for table, l1 in [(METRPO, "paper"), (METRPO, "robust"), (MBMF, "paper")]:
         signs: dict[str, list[bool]] = {}
         for task in SCALES:
             for noise in NOISES:
-                found = ours(task, noise, l1)
+                found = ours(table, task, noise, l1)
                 if found is None or found.pair is None:
                     continue
                 differences = map(float, found.pair["differences"].split())
@@ -205,7 +223,8 @@ def ahead() -> None:
             group: f"{sum(signs[group])} of {len(signs[group])}" if signs.get(group) else ""
             for group in groups
         }
-        lines.append({"L1 in training": l1, "share": share, **counted})
+        arm = {"algorithm": table.algorithm, "L1 in training": l1}
+        lines.append({**arm, "share": share, **counted})
     (HERE / "ahead.md").write_text(markdown(lines) + "\n")
 
 
@@ -242,7 +261,8 @@ def recovered() -> None:
 
 def main() -> None:
     """Write all of it."""
-    table1()
+    for table in (METRPO, MBMF):
+        cells_of(table)
     ahead()
     recovered()
     print(f"Tables and figures: {HERE}")
