@@ -4,9 +4,9 @@
 
 Reads the tables that `torchrl-l1 evaluate` wrote into FOLDER/TASK/seed_N/bias and .../noise, if a
 FOLDER is given, and keeps their episodes in `robust/TASK.csv` beside this file, in place of those
-of the same policy.More episodes without a disturbance, of tasks whose returns scatter much, are
-in .../undisturbed and are kept in `robust/undisturbed_TASK.csv`. Writes from those
-`robust/TASK.md`, `robust/TASK.png`, `robust/overall.md` and `robust/harm.md`.
+of the same policy. More episodes without a disturbance, of tasks whose returns scatter much, are in
+.../undisturbed and are kept in `robust/undisturbed_TASK.csv`. Writes from those `robust/TASK.md`,
+`robust/TASK.png`, `robust/overall.md` and `robust/harm.md`.
 """
 
 from __future__ import annotations
