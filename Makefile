@@ -11,6 +11,9 @@ SEED ?= 0
 DEMO_DIR ?= runs/demo
 PYTEST_ARGS ?= -n auto --dist worksteal
 BENCH_ARGS ?=
+# Scripts of docs/results that write tables and figures from data that are committed there.
+STUDIES := acting any_task fit_quality hopper in_the_loop learned_rewards mbrl_cartpole offline \
+    planners precision questions robust suite
 
 export MPLBACKEND ?= Agg
 export PIP_DISABLE_PIP_VERSION_CHECK ?= 1
@@ -18,7 +21,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK ?= 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo hopper test lint format docs bench bench-smoke wheel lock clean
+.PHONY: help demo hopper test lint format docs studies bench bench-smoke wheel lock clean
 
 help: ## Show this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' Makefile
@@ -48,6 +51,10 @@ format: $(VENV)/.installed-lint ## Rewrite the sources as ruff formats them
 docs: $(VENV)/.installed-docs ## Build the documentation, warnings are errors
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 	@echo "open docs/_build/html/index.html"
+
+studies: $(VENV)/.installed-test ## Write the studies' tables and figures anew from committed data, check their pages
+	set -e; for script in $(STUDIES); do $(BIN)/python docs/results/$$script.py; done
+	$(BIN)/python -m pytest -q tests/test_studies.py
 
 bench: $(VENV)/.installed-bench ## Run all speed tables (some minutes on an otherwise idle machine)
 	$(BIN)/python -m benchmarks $(BENCH_ARGS)

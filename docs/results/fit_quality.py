@@ -295,7 +295,11 @@ def draw(rows: Sequence[Row], file: Path) -> None:
     save(figure, file)
 
 
-def main(folder: Path, quick: bool = False) -> None:
+PLANTS = {"inverted pendulum": inverted_pendulum, "Pendulum-v1": pendulum}
+FOLDER = Path(__file__).with_suffix("")
+
+
+def main(folder: Path = FOLDER, quick: bool = False) -> None:
     """Run, or with rows in the folder already draw those."""
     folder.mkdir(exist_ok=True, parents=True)
     file = folder / "runs.csv"
@@ -314,12 +318,9 @@ def main(folder: Path, quick: bool = False) -> None:
     draw(rows, folder / "quality.png")
 
 
-PLANTS = {"inverted pendulum": inverted_pendulum, "Pendulum-v1": pendulum}
-
-
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("folder", nargs="?", type=Path, default=Path(__file__).with_suffix(""))
+    parser.add_argument("folder", nargs="?", type=Path, default=FOLDER)
     parser.add_argument("--quick", action="store_true")
     arguments = parser.parse_args()
     main(arguments.folder, arguments.quick)

@@ -1,15 +1,17 @@
 """Hopper under an actuator bias: what each controller makes of it, and how it looks.
 
     torchrl-l1 run metrpo/hopper l1=off threads=1 run_dir=runs/hopper --resume
-    python docs/results/hopper.py runs/hopper
+    python docs/results/hopper.py [runs/hopper]
 
 Writes `hopper.csv` (one row per episode), `hopper.md`, `hopper.png` and the folder `hopper` with
 the filmstrip beside this file: 24 episodes of the policy's mean action per controller and bias. A
-hopper is upright until its torso is below 0.7 m, which is no end of the task's episodes.
+hopper is upright until its torso is below 0.7 m, which is no end of the task's episodes. Without a
+run, table and figure are written again from `hopper.csv`.
 """
 
 from __future__ import annotations
 
+import csv
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -42,7 +44,9 @@ def condition(controller: str, bias: float) -> Condition:
 def measure(trained: TrainedRun) -> list[Row]:
     """Rows of single episodes."""
     rows = []
-    dt = trained.algorithm.task.dt
+    algorithm = trained.algorithm
+    dt, frames = algorithm.task.dt, algorithm.collection.frames
+    trained_on = {"seed": trained.recipe.seed, "real_steps": (algorithm.iteration + 1) * frames}
     for bias in BIASES:
         for controller in CONTROLLERS:
             collection = make_collection(trained, condition(controller, bias), EPISODES)
@@ -50,7 +54,8 @@ def measure(trained: TrainedRun) -> list[Row]:
             low = (data["next", "observation"][..., 0] < FALLEN).numpy()
             steps = np.where(low.any(-1), low.argmax(-1), low.shape[-1])
             rows += [
-                {
+                trained_on
+                | {
                     "l1": controller,
                     "bias": bias,
                     "episode": episode,
@@ -105,27 +110,42 @@ def draw(rows: Sequence[Row]) -> None:
     figure.savefig(HERE / "hopper.png", dpi=110)
 
 
-def main(run: Path) -> None:
-    """All of it."""
-    trained = load_run(run)
-    rows = measure(trained)
-    write_table(HERE / "hopper.csv", rows)
-    steps = (trained.algorithm.iteration + 1) * trained.algorithm.collection.frames
-    note = (
-        f"One training seed ({trained.recipe.seed}), METRPO without L1 after {steps} real steps; "
-        f"{EPISODES} episodes of the mean action per row. Upright: until the torso is below "
-        f"{FALLEN} m for the first time."
-    )
-    (HERE / "hopper.md").write_text(f"{markdown(table(rows))}\n\n{note}\n")
-    draw(rows)
+def read(file: Path) -> list[Row]:
+    """Rows of an earlier measurement."""
+    texts = ("seed", "real_steps", "l1", "episode")
+    with file.open(newline="") as handle:
+        return [
+            {name: value if name in texts else float(value) for name, value in row.items()}
+            for row in csv.DictReader(handle)
+        ]
+
+
+def filmstrip(trained: TrainedRun) -> None:
+    """The four controllers at a bias, from the same reset."""
     output = HERE / "hopper"
     output.mkdir(exist_ok=True)
     cells = [condition(controller, -0.4) for controller in CONTROLLERS]
     write_filmstrip(trained, cells, "bias", SEED, output)
-    print(f"Table: {HERE / 'hopper.md'}, figures: {HERE / 'hopper.png'} and {output}")
+
+
+def main(run: Path | None = None) -> None:
+    """All of it, or of the rows that are there."""
+    if run is not None:
+        trained = load_run(run)
+        write_table(HERE / "hopper.csv", measure(trained))
+        filmstrip(trained)
+    rows = read(HERE / "hopper.csv")
+    note = (
+        f"One training seed ({rows[0]['seed']}), METRPO without L1 after {rows[0]['real_steps']} "
+        f"real steps; {EPISODES} episodes of the mean action per row. Upright: until the torso is "
+        f"below {FALLEN} m for the first time."
+    )
+    (HERE / "hopper.md").write_text(f"{markdown(table(rows))}\n\n{note}\n")
+    draw(rows)
+    print(f"Table: {HERE / 'hopper.md'}, figures: {HERE / 'hopper.png'} and {HERE / 'hopper'}")
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
+    if len(sys.argv) > 2:
         sys.exit(__doc__)
-    main(Path(sys.argv[1]))
+    main(*map(Path, sys.argv[1:]))

@@ -2,10 +2,11 @@
 
     torchrl-l1 dataset RUN_DIR datasets/TASK/QUALITY.npz --quality QUALITY    # for each
     torchrl-l1 campaign offline --output runs/offline
-    python docs/results/offline.py runs/offline
+    python docs/results/offline.py [runs/offline]
 
-Writes `summary.csv`, `returns.md`, `recovered.md`, `imagination.md` and `returns.png` to the
-folder `offline` beside this file.
+Writes `cells.csv` (returns of the episodes of each run, controller and bias), `summary.csv`,
+`returns.md`, `recovered.md`, `imagination.md` and `returns.png` to the folder `offline` beside this
+file; without a campaign's runs, all but the first again from it.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
+from torchrl_l1.envs import get_task
 from torchrl_l1.experiment.files import write_table
 from torchrl_l1.experiment.run_directory import read_config
 from torchrl_l1.report.page import markdown, number
@@ -32,7 +34,11 @@ RESAMPLES = 2000
 Row = dict[str, Any]
 
 
-def read(folder: Path) -> list[Row]:
+# What is the same for all episodes of a row of `cells.csv`.
+CELL = ("task", "quality", "seed", "l1", "bias", "data_reward", "clone")
+
+
+def measured(folder: Path) -> list[Row]:
     """Rows of single episodes of all evaluated runs."""
     rows = []
     for file in sorted(folder.rglob("evaluations/episodes/disturbances.csv")):
@@ -55,6 +61,34 @@ def read(folder: Path) -> list[Row]:
                         "clone": round(float(last.get("clone/return", "nan")), 5),
                     }
                 )
+    return rows
+
+
+def keep(rows: Sequence[Row], file: Path) -> None:
+    """One row for all episodes of a run, a controller and a bias, in order."""
+    cells: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        cells.setdefault(tuple(row[name] for name in CELL), []).append(row)
+    write_table(
+        file,
+        [
+            {**dict(zip(CELL, key, strict=True)), "returns": " ".join(str(e["return"]) for e in of)}
+            for key, of in cells.items()
+        ],
+    )
+
+
+def kept(file: Path) -> list[Row]:
+    """Rows of single episodes, as they were measured."""
+    rows = []
+    with file.open(newline="") as handle:
+        for cell in csv.DictReader(handle):
+            numbers = {name: float(cell[name]) for name in ("bias", "data_reward", "clone")}
+            common = {"task": cell["task"], "quality": cell["quality"], "l1": cell["l1"], **numbers}
+            rows += [
+                {**common, "seed": int(cell["seed"]), "episode": episode, "return": float(value)}
+                for episode, value in enumerate(cell["returns"].split())
+            ]
     return rows
 
 
@@ -238,14 +272,14 @@ def draw(summary: Sequence[Row]) -> None:
     figure.savefig(HERE / "returns.png", dpi=110)
 
 
-def main(folder: Path) -> None:
-    """All of it."""
-    from torchrl_l1.envs import get_task
-
-    rows = read(folder)
-    if not rows:
-        sys.exit(f"no evaluated runs below {folder}")
+def main(folder: Path | None = None) -> None:
+    """All of it, or of the episodes that are there."""
     HERE.mkdir(exist_ok=True)
+    if folder is not None:
+        if not (found := measured(folder)):
+            sys.exit(f"no evaluated runs below {folder}")
+        keep(found, HERE / "cells.csv")
+    rows = kept(HERE / "cells.csv")
     summary = summarize(rows)
     shown = [{k: f"{v:.5g}" if isinstance(v, float) else v for k, v in r.items()} for r in summary]
     write_table(HERE / "summary.csv", shown)
@@ -258,6 +292,6 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
+    if len(sys.argv) > 2:
         sys.exit(__doc__)
-    main(Path(sys.argv[1]))
+    main(*map(Path, sys.argv[1:]))
