@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -25,12 +25,15 @@ from torchrl.envs.transforms import (
     VecNormV2,
 )
 
-from torchrl_l1.control.config import L1Config, Scalars
+from torchrl_l1.control.config import L1Config, Scalars, with_open_bounds
 
 # Wrappers of Gymnasium that repeat an action keep the number under one of these, by custom.
 _REPEATS = ("_skip", "skip", "_frame_skip", "frame_skip", "action_repeat")
 
 _TOLERANCE = 1e-4
+
+# In place of a time step that is not known yet: so short that no setting is too fast for it.
+_SHORT = 1e-6
 
 
 def chain_of(transform: Transform) -> list[Transform]:
@@ -241,11 +244,8 @@ def _number(value: Any) -> float | None:
     return number if math.isfinite(number) and number > 0 else None
 
 
-def check_time_step(owner: str, dt: float, env: EnvBase) -> bool:
-    """Refuse a ``dt`` that is not the environment's.
-
-    Returns:
-        whether the environment told its own.
+def check_time_step(owner: str, dt: float, env: EnvBase) -> None:
+    """Refuse a ``dt`` that is not the environment's, where that tells its own.
 
     Raises:
         ValueError: naming both.
@@ -256,7 +256,6 @@ def check_time_step(owner: str, dt: float, env: EnvBase) -> bool:
             f"{owner} has dt={dt:.6g}, but a step of the environment takes {told:.6g} s: leave dt "
             "out or give that, or check_dt=False if the environment is wrong"
         )
-    return told is not None
 
 
 class Settings:
@@ -304,29 +303,18 @@ class Settings:
         if not self.is_complete:
             dt = time_step(env)
             if dt is None:
-                raise ValueError(self.missing)
+                raise ValueError(
+                    f"{self.owner} needs dt, the time of one environment step in seconds: the "
+                    "environment does not tell it"
+                )
             self.config = L1Config(dt, **self._others)
             self.is_complete = True
         return self.config
 
     def bound(self, low: Scalars | None, high: Scalars | None) -> None:
         """Fill action bounds that are open."""
-        config = self.config
-        low = low if config.action_low is None else config.action_low
-        high = high if config.action_high is None else config.action_high
-        self.config = replace(config, action_low=low, action_high=high)
-        self._others |= {"action_low": low, "action_high": high}
-
-    @property
-    def missing(self) -> str:
-        """What to say where the time step is not known."""
-        return (
-            f"{self.owner} needs dt, the time of one environment step in seconds: the environment "
-            "does not tell it"
-        )
-
-
-_SHORT = 1e-6
+        config = self.config = with_open_bounds(self.config, low, high)
+        self._others |= {"action_low": config.action_low, "action_high": config.action_high}
 
 
 def leaf_spec(spec: TensorSpec) -> TensorSpec:
