@@ -19,7 +19,7 @@ from torchrl_l1.checks import check_optional_count
 from torchrl_l1.envs.cells import PAGE, Cell, GymnasiumCell, TorchRLCell
 from torchrl_l1.envs.known_rewards import Outcome
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv, keep_others, stepped_rows
-from torchrl_l1.envs.plant import Plant, disturbed_model
+from torchrl_l1.envs.plant import Plant, cannot_change, disturbed_model, survives_resets
 from torchrl_l1.envs.references import making
 from torchrl_l1.envs.sources import EnvironmentSource, environment_source
 from torchrl_l1.envs.task import BadAction, RewardFn, Scalars, Task
@@ -150,12 +150,8 @@ class ExternalTask:
             ValueError: naming the disturbance.
         """
         for name in names:
-            if not self.has_plant or name == "wind":  # which Gymnasium's resets would undo
-                raise ValueError(
-                    f"{name} changes the plant, which needs a task of ours or one of Gymnasium's "
-                    f"MuJoCo environments{' and no wind' * (name == 'wind')}, not {self.name}: "
-                    "leave it out"
-                )
+            if not (self.has_plant and survives_resets(name)):
+                raise ValueError(cannot_change(self.name, name))
 
     def environment(self, num_envs: int, **settings: Any) -> ExternalEnv:
         """So many environments side by side, see :class:`ExternalEnv`."""
