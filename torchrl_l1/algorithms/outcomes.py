@@ -147,7 +147,7 @@ class Outcomes:
             "elites": None,
         }
         self.fit_config = replace(fit or FitConfig(), **alone)
-        self.seed, self.device = seed, torch.device(device)
+        self.task, self.seed, self.device = task, seed, torch.device(device)
         self.models: dict[str, RewardModel | TerminationModel] = {}
         n, m = task.observation_dim, task.action_dim
         networks = vars(config or OutcomeConfig())
@@ -181,13 +181,15 @@ class Outcomes:
         """Whether data must say where episodes terminated."""
         return "termination_model" in self.models
 
-    def terminated(self, builtin: Termination | None) -> Termination | None:
+    def termination(self, as_task: bool = True) -> Termination | None:
         """What ends imagined trajectories; nothing does if ``None``.
 
         Args:
-            builtin: what the algorithm takes of its task, if it is to.
+            as_task: whether they end as the task does, where ``termination`` is ``builtin``.
         """
-        return builtin if self.own_termination else self._termination
+        if not self.own_termination:
+            return self._termination
+        return self.task.terminated if as_task and self.task.terminates else None
 
     def fit(self, buffer: ReplayBuffer, action_key: str, iteration: int) -> dict[str, float]:
         """Fit what is learned to all data, from the weights that it has; returns its metrics.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from torchrl_l1.algorithms.config import ModelConfig, check_plans
+from torchrl_l1.algorithms.config import ModelConfig, check_planning
 from torchrl_l1.checks import (
     check_choice,
     check_counts,
@@ -76,7 +76,7 @@ class PETSConfig:
         check_not_negative("evaluation_episodes", self.evaluation_episodes)
         check_optional_count("episode_steps", self.episode_steps)
         check_optional_count("random_steps", self.random_steps)
-        check_plans(self, "cem", self.cem.horizon)
+        check_planning(self, "cem", self.cem.horizon)
 
     def collected_episodes(self, iterations: int) -> int:
         """Real episodes of so many outer iterations; random data do not count."""
