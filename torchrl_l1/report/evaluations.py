@@ -22,6 +22,7 @@ from torchrl_l1.report.identity import BASELINE, facts
 from torchrl_l1.report.page import (
     Footnotes,
     Page,
+    Row,
     difference_text,
     grouped,
     markdown,
@@ -46,7 +47,6 @@ from torchrl_l1.report.statistics import difference_summary, mean_summary
 from torchrl_l1.report.study import Study, noise_order, variant_text
 from torchrl_l1.report.style import arm_label, named
 
-Row = Mapping[str, Any]
 Key = tuple[Any, ...]
 Section = Callable[[Page, AlgorithmFacts, Sequence[Row]], None]
 
@@ -271,7 +271,7 @@ def evaluation_rows(study: Study, name: str) -> list[dict[str, Any]]:
     return rows
 
 
-def ablation_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def ablation_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Those rows of an evaluation that the ablation is made of, with the ``phase`` of L1.
 
     The test has the noise of the training and no disturbance, and L1 is on in both phases, in
