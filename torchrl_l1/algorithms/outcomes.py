@@ -23,6 +23,7 @@ from torchrl_l1.dynamics import (
     fit_termination,
 )
 from torchrl_l1.dynamics.ensemble import ACTIVATIONS
+from torchrl_l1.dynamics.imagination import RewardFunction, Termination
 from torchrl_l1.dynamics.transitions import split_validation
 from torchrl_l1.envs import AnyTask, ExternalTask, StartStates, Task, action_bounds, load_attribute
 
@@ -47,8 +48,6 @@ OUTCOME_METRICS: dict[str, str] = {
     "out of training that it calls terminal.",
 }
 """What the fits of learned rewards and terminations report."""
-
-Termination = Callable[[Tensor], Tensor]
 
 
 @dataclass
@@ -151,7 +150,7 @@ class Outcomes:
         self.models: dict[str, RewardModel | TerminationModel] = {}
         n, m = task.observation_dim, task.action_dim
         networks = vars(config or OutcomeConfig())
-        self.reward: Callable[[Tensor, Tensor, Tensor], Tensor]
+        self.reward: RewardFunction
         self._termination: Termination | None = None
         self.own_termination = termination == "builtin"
         with self._stream("initialisation"):
