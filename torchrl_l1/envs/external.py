@@ -16,11 +16,11 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymEnv, GymWrapper
 
 from torchrl_l1.checks import check_optional_count
-from torchrl_l1.envs.cells import PAGE, Cell, GymnasiumCell, TorchRLCell
 from torchrl_l1.envs.known_rewards import Outcome
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv, keep_others, stepped_rows
 from torchrl_l1.envs.plant import Plant, cannot_change, disturbed_model, survives_resets
 from torchrl_l1.envs.references import making
+from torchrl_l1.envs.single import PAGE, SingleEnv, SingleGymnasiumEnv, SingleTorchRLEnv
 from torchrl_l1.envs.sources import EnvironmentSource, environment_source
 from torchrl_l1.envs.task import BadAction, RewardFn, Scalars, Task
 
@@ -66,28 +66,28 @@ class ExternalTask:
         self.source, self.name = source, source.name or "the environment"
         self._keys = tuple(observation_keys)
         check_optional_count("horizon", horizon)
-        cell = self._cell()
+        single = self._single()
         try:
-            self.observation_dim = cell.observation_dim
-            self.action_dim = len(cell.low)
-            self.action_low, self.action_high = _scalars(cell.low), _scalars(cell.high)
-            self.dt = self._told("dt", "SECONDS", "how long a step takes", dt, cell.time_step())
+            self.observation_dim = single.observation_dim
+            self.action_dim = len(single.low)
+            self.action_low, self.action_high = _scalars(single.low), _scalars(single.high)
+            self.dt = self._told("dt", "SECONDS", "how long a step takes", dt, single.time_step())
             if dt is not None and abs(dt - self.dt) > 1e-6 * self.dt:
                 raise ValueError(f"dt: a step of {self.name} takes {self.dt:g} s, not {dt:g}")
             self.horizon = horizon or self._told(
-                "horizon", "STEPS", "how long an episode is", None, cell.horizon()
+                "horizon", "STEPS", "how long an episode is", None, single.horizon()
             )
-            self.outcome = cell.outcome()
-            self.has_plant = cell.simulation() is not None
+            self.outcome = single.outcome()
+            self.has_plant = single.simulation() is not None
         finally:
-            cell.close()
+            single.close()
 
     def _told(self, key: str, unit: str, what: str, given: Any, told: Any) -> Any:
         if told is None and given is None:
             raise ValueError(f"{self.name} does not tell {what}: give {key}={unit} ({PAGE})")
         return given if told is None else told
 
-    def _cell(self, limited: bool = True) -> Cell:
+    def _single(self, limited: bool = True) -> SingleEnv:
         """One environment, by itself.
 
         Args:
@@ -97,12 +97,12 @@ class ExternalTask:
             options: dict[str, Any] = {} if limited else {"max_episode_steps": -1}
             with making(self.name):
                 made = gymnasium.make(self.source.gymnasium_id, disable_env_checker=True, **options)
-            return GymnasiumCell(made, self.name, self._keys)
+            return SingleGymnasiumEnv(made, self.name, self._keys)
         env = self.source.build()
         plain = type(env) in (GymEnv, GymWrapper) and getattr(env, "wrapper_frame_skip", 1) == 1
         if plain and isinstance(env._env, gymnasium.Env):
-            return GymnasiumCell(env._env, self.name, self._keys)
-        return TorchRLCell(env, self.name, self._keys)
+            return SingleGymnasiumEnv(env._env, self.name, self._keys)
+        return SingleTorchRLEnv(env, self.name, self._keys)
 
     @property
     def imagined_reward(self) -> RewardFn:
@@ -211,12 +211,12 @@ class ExternalEnv(EnvBase):
         super().__init__(device="cpu", batch_size=[num_envs])
         self.task, self.num_envs, self.max_steps, self._dtype = task, num_envs, max_steps, dtype
         task.check_disturbances(list(plant or {}))
-        self.cells = [task._cell(limited=False) for _ in range(num_envs)]
-        self._models = [cell.simulation().model for cell in self.cells if plant]
+        self.members = [task._single(limited=False) for _ in range(num_envs)]
+        self._models = [member.simulation().model for member in self.members if plant]
         self._plant = Plant(self._models[0], num_envs, plant) if plant else None
         self._change_plant(np.arange(num_envs))
-        self._low = np.stack([cell.low for cell in self.cells])
-        self._high = np.stack([cell.high for cell in self.cells])
+        self._low = np.stack([member.low for member in self.members])
+        self._high = np.stack([member.high for member in self.members])
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._observation = np.zeros((num_envs, task.observation_dim), dtype=np.float32)
         self._make_specs()
@@ -244,7 +244,7 @@ class ExternalEnv(EnvBase):
         for index in indices if values else ():
             changes = {name: float(each[index]) for name, each in values.items()}
             changed = disturbed_model(self._models[index], changes)
-            self.cells[index].simulation().model = changed
+            self.members[index].simulation().model = changed
 
     def _emitted(self) -> Tensor:
         return torch.from_numpy(self._observation.copy()).to(self._dtype)
@@ -258,7 +258,7 @@ class ExternalEnv(EnvBase):
             self._plant.redraw(indices)
             self._change_plant(indices)
         for index in indices:
-            self._observation[index] = self.cells[index].reset(int(self._rng.integers(2**31)))
+            self._observation[index] = self.members[index].reset(int(self._rng.integers(2**31)))
         self._steps[indices] = 0
         return self._data({}, *(np.zeros(self.num_envs, dtype=bool) for _ in range(3)))
 
@@ -272,7 +272,7 @@ class ExternalEnv(EnvBase):
         reward = np.zeros(self.num_envs, dtype=np.float32)
         bad, terminated, truncated = (np.zeros(self.num_envs, dtype=bool) for _ in range(3))
         for index in np.flatnonzero(chosen):
-            stepping = self.cells[index].step(actions[index])
+            stepping = self.members[index].step(actions[index])
             observation, earned, terminated[index], truncated[index] = stepping
             bad[index] = not (np.isfinite(observation).all() and np.isfinite(earned))
             if not bad[index]:
@@ -305,8 +305,8 @@ class ExternalEnv(EnvBase):
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Free all environments."""
-        for cell in self.cells:
-            cell.close()
+        for member in self.members:
+            member.close()
         super().close(raise_if_closed=raise_if_closed)
 
 
