@@ -53,6 +53,9 @@ Section = Callable[[Page, AlgorithmFacts, Sequence[Row]], None]
 # Longer tables are left to their CSV.
 _MOST_ROWS = 160
 
+# Columns of what was measured, with the field of an evaluation that each shows and a factor.
+_MEANS = {"steps_mean": ("steps_mean", 1), "switches_per_1000_steps": ("switch_rate", 1000)}
+
 
 def evaluation_sections(page: Page, study: Study) -> None:
     """A section per evaluation: those of the paper first, then the user's own."""
@@ -322,12 +325,10 @@ def _summary(tests: Sequence[tuple[Run, Evaluation]]) -> dict[str, Any]:
         "return_values": " ".join(f"{value:.6g}" for value in values),
         **mean,
     }
-    steps = float(np.mean([test.steps_mean for _, test in tests]))
-    if np.isfinite(steps):
-        result["steps_mean"] = steps
-    switches = 1000 * float(np.mean([test.switch_rate for _, test in tests]))
-    if np.isfinite(switches):
-        result["switches_per_1000_steps"] = switches
+    for column, (field, factor) in _MEANS.items():
+        value = factor * float(np.mean([getattr(test, field) for _, test in tests]))
+        if np.isfinite(value):
+            result[column] = value
     return result
 
 
