@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -16,6 +17,9 @@ from torchrl_l1.checks import (
 from torchrl_l1.dynamics import HEADS, MODEL_FORMS, EnsembleDynamics
 from torchrl_l1.dynamics.ensemble import ACTIVATIONS
 from torchrl_l1.planning import TrajectorySampler, check_sampling, resolve_compilation
+
+LABELS: Mapping[str, str] = {"nominal": "action", "executed": "executed"}
+"""What ``label`` may be, with the key of the action that the model is then fitted to."""
 
 
 class PlanSettings(Protocol):

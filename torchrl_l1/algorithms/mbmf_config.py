@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from torchrl_l1.algorithms.config import ModelConfig, check_planning
+from torchrl_l1.algorithms.config import LABELS, ModelConfig, check_planning
 from torchrl_l1.algorithms.facts import Stage
 from torchrl_l1.checks import (
     check_choice,
@@ -196,7 +196,7 @@ class MBMFConfig:
     fine_tuning: FineTuningConfig = field(default_factory=FineTuningConfig)
 
     def __post_init__(self) -> None:
-        check_choice("label", self.label, ("nominal", "executed"))
+        check_choice("label", self.label, tuple(LABELS))
         check_counts(
             self,
             "outer_iterations",
