@@ -12,12 +12,18 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Bounded
 from torchrl.envs import EnvBase, GymEnv, GymWrapper
 
 from torchrl_l1.checks import check_optional_count
 from torchrl_l1.envs.known_rewards import Outcome
-from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv, keep_others, stepped_rows
+from torchrl_l1.envs.mujoco_env import (
+    BatchedMujocoEnv,
+    declare_specs,
+    keep_others,
+    reset_rows,
+    stepped_rows,
+)
 from torchrl_l1.envs.plant import Plant, cannot_change, disturbed_model, survives_resets
 from torchrl_l1.envs.references import making
 from torchrl_l1.envs.single import PAGE, SingleEnv, SingleGymnasiumEnv, SingleTorchRLEnv
@@ -219,22 +225,10 @@ class ExternalEnv(EnvBase):
         self._high = np.stack([member.high for member in self.members])
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._observation = np.zeros((num_envs, task.observation_dim), dtype=np.float32)
-        self._make_specs()
-        self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
-
-    def _make_specs(self) -> None:
-        batch, dtype = self.batch_size, self._dtype
-        self.observation_spec = Composite(
-            observation=Unbounded((*batch, self.task.observation_dim), dtype=dtype),
-            non_finite=Binary(shape=(*batch, 1), dtype=torch.bool),
-            shape=batch,
-        )
         low, high = (torch.from_numpy(bound).to(dtype) for bound in (self._low, self._high))
-        self.action_spec = Bounded(low, high, low.shape, dtype=dtype)
-        self.reward_spec = Unbounded((*batch, 1), dtype=dtype)
-        flags = ("done", "terminated", "truncated")
-        flag = Binary(shape=(*batch, 1), dtype=torch.bool)
-        self.full_done_spec = Composite({key: flag.clone() for key in flags}, shape=batch)
+        action_spec = Bounded(low, high, low.shape, dtype=dtype)
+        declare_specs(self, task.observation_dim, action_spec, dtype)
+        self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
 
     def _set_seed(self, seed: int | None) -> None:
         self._rng = np.random.default_rng(seed)
@@ -250,10 +244,7 @@ class ExternalEnv(EnvBase):
         return torch.from_numpy(self._observation.copy()).to(self._dtype)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        indices = np.arange(self.num_envs)
-        if mask is not None:
-            indices = np.flatnonzero(mask.reshape(self.num_envs, -1).any(-1).numpy())
+        indices = reset_rows(tensordict, self.num_envs)
         if self._plant is not None and self._plant.is_drawn:
             self._plant.redraw(indices)
             self._change_plant(indices)
