@@ -34,7 +34,7 @@ Row = dict[str, Any]
 _ONLY = "the episodes of one policy"
 
 
-def tested_disturbances(disturbances: Disturbances) -> list[dict[str, float]]:
+def single_disturbances(disturbances: Disturbances) -> list[dict[str, float]]:
     """What is tested: undisturbed first, then each value of each disturbance by itself, once.
 
     Args:
@@ -44,7 +44,7 @@ def tested_disturbances(disturbances: Disturbances) -> list[dict[str, float]]:
         ValueError: for a disturbance or suite that there is not, or a value that it cannot have.
 
     Examples:
-        >>> tested_disturbances({"bias": [0.0, 0.5], "gain": 0.6})
+        >>> single_disturbances({"bias": [0.0, 0.5], "gain": 0.6})
         [{}, {'bias': 0.5}, {'gain': 0.6}]
     """
     if isinstance(disturbances, str):
@@ -306,7 +306,7 @@ def assess(
         on_cell: called with the number of all cells after each, for progress bars.
         heading: of the chart.
     """
-    cells = tested_disturbances(disturbances)
+    cells = single_disturbances(disturbances)
     if isinstance(disturbances, str):
         cells = [cell for cell in cells if all(source.takes(DISTURBANCES[name]) for name in cell)]
     names = list(dict.fromkeys(name for cell in cells for name in cell))
