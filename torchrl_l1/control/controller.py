@@ -34,7 +34,6 @@ from torchrl_l1.control.pipeline import (
     Settings,
     carry,
     chain_of,
-    check_time_step,
     leaf_spec,
     unspecified,
     warn_of_surroundings,
@@ -42,6 +41,7 @@ from torchrl_l1.control.pipeline import (
 )
 from torchrl_l1.control.seal import SEAL, Emitted, sealed
 from torchrl_l1.control.state import L1Diagnostics, L1State, state_names
+from torchrl_l1.control.step_time import check_time_step
 
 
 class _Environment:
