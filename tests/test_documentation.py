@@ -74,6 +74,13 @@ def test_relative_links_lead_somewhere() -> None:
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
+def test_files_that_contributing_names_are_there() -> None:
+    named = re.findall(r"`([\w/]+(?:\.py|/))`", (ROOT / "CONTRIBUTING.md").read_text())
+    assert len(named) > 20
+    for name in named:
+        assert (ROOT / name).exists() or (ROOT / "torchrl_l1" / name).exists(), name
+
+
 def words(text: str) -> set[str]:
     """What stands in backticks and is a plain name."""
     return set(re.findall(r"`\"?([A-Za-z_0-9]+)\"?`", text))

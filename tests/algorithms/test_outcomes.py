@@ -88,7 +88,8 @@ def test_the_rest_of_a_run_draws_what_it_drew(monkeypatch: pytest.MonkeyPatch) -
     plain = [result.metrics for result in make().iterate()]
     learned = make(**LEARNED)
     monkeypatch.setattr(learned.outcomes, "reward", learned.task.imagined_reward)
-    monkeypatch.setattr(learned.outcomes, "terminated", lambda builtin: builtin)
+    own = learned.task.terminated
+    monkeypatch.setattr(learned.outcomes, "termination", lambda as_task: own if as_task else None)
     for before, result in zip(plain, learned.iterate(), strict=True):
         assert {n: v for n, v in result.metrics.items() if n not in OUTCOME_METRICS} == before
 
@@ -220,18 +221,19 @@ def test_a_function_of_ones_own(tmp_path: Path) -> None:
     next(algorithm.iterate())
     outcomes, x = algorithm.outcomes, torch.randn(5, 17)
     torch.testing.assert_close(outcomes.reward(x, torch.ones(5, 6), x), x[:, 8] - 0.6)
-    assert torch.equal(outcomes.terminated(None)(x), x[:, 0] < 0.8)
+    assert torch.equal(outcomes.termination()(x), x[:, 0] < 0.8)
     assert not outcomes.models and not outcomes.state_dict()
 
 
 def test_who_ends_what_is_imagined() -> None:
-    task, own = get_task("walker"), get_task("walker").terminated
-    assert Outcomes(task).terminated(own) is own
-    assert Outcomes(task).terminated(None) is None
-    assert Outcomes(task, termination="none").terminated(own) is None
+    task = get_task("walker")
+    assert Outcomes(task).termination() is task.terminated
+    assert Outcomes(task).termination(as_task=False) is None
+    assert Outcomes(get_task("hopper")).termination() is None
+    assert Outcomes(task, termination="none").termination() is None
     learned = Outcomes(task, termination="learned")
-    assert learned.terminated(own) is learned.models["termination_model"]
-    assert learned.terminated(None) is learned.models["termination_model"]
+    assert learned.termination() is learned.models["termination_model"]
+    assert learned.termination(as_task=False) is learned.models["termination_model"]
 
 
 BAD = {

@@ -7,7 +7,7 @@ from PIL import Image
 from tensordict import TensorDict
 
 from torchrl_l1.deployment import Assessment
-from torchrl_l1.deployment.assessment import disturbance_cells, summarize_episodes
+from torchrl_l1.deployment.assessment import single_disturbances, summarize_episodes
 from torchrl_l1.envs import suite
 
 
@@ -19,18 +19,18 @@ def table(robust) -> Assessment:
 
 
 def test_cells():
-    assert disturbance_cells("quick") == suite("quick")
-    assert disturbance_cells({}) == [{}]
+    assert single_disturbances("quick") == suite("quick")
+    assert single_disturbances({}) == [{}]
     for values in (np.linspace(0, 1, 3), torch.tensor([0.5, 1.0]), (0.5, 0.5, 1.0)):
-        assert disturbance_cells({"bias": values}) == [{}, {"bias": 0.5}, {"bias": 1.0}]
+        assert single_disturbances({"bias": values}) == [{}, {"bias": 0.5}, {"bias": 1.0}]
     with pytest.raises(ValueError, match="unknown disturbance 'wobble'"):
-        disturbance_cells({"wobble": [1.0]})
+        single_disturbances({"wobble": [1.0]})
     with pytest.raises(ValueError, match="unknown suite"):
-        disturbance_cells("slow")
+        single_disturbances("slow")
     with pytest.raises(ValueError, match=r"disturbances are values by name, .* got None"):
-        disturbance_cells(None)
+        single_disturbances(None)
     with pytest.raises(ValueError, match="finite"):
-        disturbance_cells({"bias": float("nan")})
+        single_disturbances({"bias": float("nan")})
 
 
 def test_episodes_count_up_to_their_end():

@@ -161,7 +161,7 @@ def test_environments_that_a_mask_leaves_out_stay_as_they_are():
     data = env.rand_step(env.reset())
     masked = env.step_mdp(data).set("_step", torch.tensor([[True], [False]]))
     stayed = env.step(masked.set("action", torch.tensor([[0.5], [torch.nan]])))["next"]
-    assert [cell.env.unwrapped.steps for cell in env.cells] == [2, 1]
+    assert [member.env.unwrapped.steps for member in env.members] == [2, 1]
     assert torch.equal(stayed["observation"][1], data["next", "observation"][1])
     assert stayed["reward"][1] == 0 and stayed["reward"][0] != 0
     assert env._steps.tolist() == [2, 1]
@@ -290,7 +290,8 @@ def test_batches_and_missing_vectors_of_torchrl_are_refused():
 def test_plants_of_gymnasiums_mujoco_can_be_changed():
     task = get_task("gymnasium/InvertedPendulum-v5")
     plain, heavy = (make_env(task, 2, seed=0, **more) for more in ({}, {"mass": 2.0}))
-    before, after = (env.base_env.cells[0].simulation().model.body_mass for env in (plain, heavy))
+    members = [env.base_env.members[0] for env in (plain, heavy)]
+    before, after = (member.simulation().model.body_mass for member in members)
     np.testing.assert_allclose(after, 2 * before)
     with pytest.raises(ValueError, match="wind"):
         make_env(task, 2, wind=0.5)
@@ -303,7 +304,7 @@ def test_plants_of_gymnasiums_mujoco_have_values_of_their_own():
     actions = torch.linspace(-1, 1, 6).reshape(6, 1)
 
     def masses(env):
-        models = [cell.simulation().model for cell in env.base_env.cells]
+        models = [member.simulation().model for member in env.base_env.members]
         return [model.body_mass.sum() for model in models]
 
     (plain,) = masses(make_env(task, 1, seed=0))
@@ -315,7 +316,7 @@ def test_plants_of_gymnasiums_mujoco_have_values_of_their_own():
     made.reset(seed=0)
     state = data["observation"][1].double().numpy()
     made.set_state(state[:2], state[2:])
-    env.base_env.cells[1].simulation().set_state(state[:2], state[2:])
+    env.base_env.members[1].simulation().set_state(state[:2], state[2:])
     for action in actions:
         data = env.step_mdp(env.step(data.set("action", action.expand(2, 1))))
         expected = made.step(action.numpy())[0]

@@ -22,6 +22,11 @@ from torchrl_l1.experiment.settings import L1Settings
 Recipe = Callable[..., DictConfig]
 
 
+def test_settings_of_recipes_have_the_names_and_defaults_of_the_controllers() -> None:
+    ours = {n: v for n, v in vars(L1Settings()).items() if n not in ("enabled", "compile")}
+    assert ours == {name: getattr(L1Config(0.04), name) for name in ours}
+
+
 def test_shipped_options_are_closest_to_themselves() -> None:
     assert set(l1_options()) >= {"off", "paper", "reference", "slow"}
     for name, settings in l1_options().items():

@@ -10,7 +10,7 @@ import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import pytest
 import torch
@@ -25,7 +25,7 @@ from torchrl_l1.campaign.plan import plan
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.evaluate import evaluate, load_run
-from torchrl_l1.experiment.files import save_atomically
+from torchrl_l1.experiment.files import saved, write_atomically
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.matrix import conditions
 from torchrl_l1.experiment.run import run
@@ -264,15 +264,14 @@ def test_interrupted_write_leaves_the_old_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "checkpoint.pt"
-    save_atomically(file, {"iteration": 1})
+    write_atomically(file, saved({"iteration": 1}))
 
-    def fail_midway(state: object, handle: IO[bytes]) -> None:
-        handle.write(b"half a check")
+    def killed(descriptor: int) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(torch, "save", fail_midway)
+    monkeypatch.setattr(os, "fsync", killed)
     with pytest.raises(KeyboardInterrupt):
-        save_atomically(file, {"iteration": 2})
+        write_atomically(file, saved({"iteration": 2}))
     assert torch.load(file, weights_only=True) == {"iteration": 1}
 
 

@@ -14,8 +14,6 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 
-CALLS = []
-
 
 class Odd(gymnasium.Env):
     dt = 0.1

@@ -31,13 +31,6 @@ def write_rows(file: Path, rows: Sequence[dict[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def evaluation_row(l1: str, noise: str = "none", **values: Any) -> dict[str, Any]:
-    """A row as ``torchrl_l1.experiment.evaluate`` yields it, short of the signals of L1."""
-    row = {"run": "somewhere", "training_seed": 0, "l1": l1, "noise": noise, "bias": 0.0}
-    row |= {"gain": 1.0, "policy": "stochastic", "return_mean": 0.0, "return_std": 1.0}
-    return row | {"return_min": -1.0, "return_max": 1.0, "episodes": 25, **values}
-
-
 def run_directory(
     path: Path,
     returns: Sequence[float],

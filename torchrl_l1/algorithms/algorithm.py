@@ -76,7 +76,8 @@ class Diverged(ValueError):
 # Transitions that a model has to predict in numbers.
 _PROBED = 64
 
-# What is finite in every round of a training that goes well, and the settings behind it if not.
+# What is finite in every round of a training that goes well, and the settings behind it if not: of
+# all algorithms, by the beginnings of their metrics' names.
 _FINITE = {
     "model/": "fit.learning_rate, model.std_floor and the data's scale",
     "reward_model/": "fit.learning_rate, model.std_floor and the rewards' scale",
@@ -98,7 +99,8 @@ class IterationResult:
     Attributes:
         metrics: by name.
         seconds: wall-clock time by phase.
-        diverged: what went wrong in it, where :attr:`Algorithm.on_divergence` lets it go on.
+        diverged: what went wrong in it, where the algorithm goes on all the same, see
+            :class:`Algorithm`.
     """
 
     metrics: dict[str, float]
@@ -383,7 +385,12 @@ class Algorithm(ABC):
             )
 
     def complete(self, real_steps: int, metrics: Mapping[str, float]) -> IterationResult:
-        """End the outer iteration after so many real steps in all.
+        """End the outer iteration.
+
+        Args:
+            real_steps: so far, in all.
+            metrics: those of ``facts.metrics`` but for the first two; those who run and report an
+                algorithm need ``return_mean`` and ``return_deterministic`` of every iteration.
 
         Raises:
             Diverged: if a metric is not finite that should be.

@@ -99,6 +99,21 @@ class Collection:
 
     An environment whose episode ends early starts another, until each has taken ``horizon``
     steps. Every call starts from a fresh reset and a fresh seed, so that no state outlives it.
+
+    Args:
+        task: what the environments are of.
+        episodes: how many.
+        policy: what acts.
+        dynamics: the model that L1 uses.
+        l1: the controller; ``None`` for none, or :data:`ORACLE`.
+        perturbation: noise and disturbances.
+        horizon: steps of each; the task's own if ``None``.
+        compile_l1: whether to compile the controller's step.
+
+    Attributes:
+        horizon: steps of an episode.
+        frames: steps of all episodes together.
+        env: with the perturbation, L1 and what the policy needs.
     """
 
     def __init__(

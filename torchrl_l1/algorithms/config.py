@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -15,8 +16,10 @@ from torchrl_l1.checks import (
 )
 from torchrl_l1.dynamics import HEADS, MODEL_FORMS, EnsembleDynamics
 from torchrl_l1.dynamics.ensemble import ACTIVATIONS
-from torchrl_l1.envs import AnyTask
 from torchrl_l1.planning import TrajectorySampler, check_sampling, resolve_compilation
+
+LABELS: Mapping[str, str] = {"nominal": "action", "executed": "executed"}
+"""What ``label`` may be, with the key of the action that the model is then fitted to."""
 
 
 class PlanSettings(Protocol):
@@ -32,25 +35,21 @@ class PlanSettings(Protocol):
 def make_sampler(
     settings: PlanSettings,
     dynamics: EnsembleDynamics,
-    task: AnyTask,
     outcomes: Outcomes,
     **more: Any,
 ) -> TrajectorySampler:
-    """What values plans on a task, as an algorithm's settings say.
+    """What values plans, as an algorithm's settings say.
 
     Args:
         settings: those of the algorithm.
         dynamics: the model.
-        task: whose termination is the built-in one.
         outcomes: for reward and termination.
         **more: what only some algorithms set of :class:`~torchrl_l1.planning.TrajectorySampler`.
     """
     return TrajectorySampler(
         dynamics,
         outcomes.reward,
-        outcomes.terminated(
-            task.terminated if outcomes.own_termination and task.terminates else None
-        ),
+        outcomes.termination(),
         settings.particles,
         settings.propagation,  # type: ignore[arg-type]
         settings.precision,  # type: ignore[arg-type]
@@ -59,7 +58,7 @@ def make_sampler(
     )
 
 
-def check_plans(settings: PlanSettings, optimizer: str, horizon: int) -> None:
+def check_planning(settings: PlanSettings, optimizer: str, horizon: int) -> None:
     """Refuse settings of a planner that make no sense, with a ``ValueError``.
 
     Args:

@@ -233,9 +233,7 @@ class MBMF(Algorithm):
 
     def _planner(self, shooting: ShootingConfig) -> ModelPredictiveController:
         config = self.config
-        sampler = make_sampler(
-            config, self.dynamics, self.task, self.outcomes, discount=config.plan_discount
-        )
+        sampler = make_sampler(config, self.dynamics, self.outcomes, discount=config.plan_discount)
         return ModelPredictiveController(
             sampler, shooting, *self._bounds(), replan_every=config.replan_every
         )

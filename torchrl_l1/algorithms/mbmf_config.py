@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from torchrl_l1.algorithms.config import ModelConfig, check_plans
+from torchrl_l1.algorithms.config import LABELS, ModelConfig, check_planning
 from torchrl_l1.algorithms.facts import Stage
 from torchrl_l1.checks import (
     check_choice,
@@ -196,7 +196,7 @@ class MBMFConfig:
     fine_tuning: FineTuningConfig = field(default_factory=FineTuningConfig)
 
     def __post_init__(self) -> None:
-        check_choice("label", self.label, ("nominal", "executed"))
+        check_choice("label", self.label, tuple(LABELS))
         check_counts(
             self,
             "outer_iterations",
@@ -210,7 +210,7 @@ class MBMFConfig:
         check_within("plan_discount", self.plan_discount, "(0, 1]")
         if self.action_bound is not None:
             check_positive("action_bound", self.action_bound)
-        check_plans(self, "shooting", self.shooting.horizon)
+        check_planning(self, "shooting", self.shooting.horizon)
 
     def collected_episodes(self, iterations: int) -> int:
         """Real episodes of so many outer iterations; random data do not count."""

@@ -149,6 +149,7 @@ class METRPO(Algorithm):
                 **improvement,
                 "policy/std": self.policy.log_std.detach().exp().mean().item(),
             }
+            # The random data are as many as those of an iteration.
             yield self.complete((iteration + 2) * self.collection.frames, metrics)
 
     @property

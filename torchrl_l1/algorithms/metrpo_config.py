@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from torchrl_l1.algorithms.config import ModelConfig
+from torchrl_l1.algorithms.config import LABELS, ModelConfig
 from torchrl_l1.checks import (
     check_choice,
     check_counts,
@@ -141,7 +141,7 @@ def check_improvement(settings: ImprovementConfig) -> None:
         ValueError: naming the setting.
     """
     resolve_precision(settings.precision)
-    check_choice("label", settings.label, ("nominal", "executed"))
+    check_choice("label", settings.label, tuple(LABELS))
     check_choice("box_exit", settings.box_exit, ("truncate", "fail"))
     check_counts(settings, "trpo_iterations", "imagined_horizon", "imagined_steps")
     if not settings.imagined_steps >= settings.imagined_horizon:

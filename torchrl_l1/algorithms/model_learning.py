@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
+from torchrl_l1.algorithms.config import LABELS
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig, FitReport, fit_ensemble
 from torchrl_l1.dynamics.fit import check_fit
 
@@ -92,7 +93,7 @@ class ModelLearning:
     ) -> None:
         check_fit(config, dynamics)
         self.dynamics, self.config = dynamics, config
-        self.action_key = "action" if label == "nominal" else "executed"
+        self.action_key = LABELS[label]
         self.optimizer = torch.optim.Adam(
             dynamics.parameters(), lr=config.learning_rate, fused=True
         )

@@ -23,6 +23,7 @@ from torchrl_l1.dynamics import (
     fit_termination,
 )
 from torchrl_l1.dynamics.ensemble import ACTIVATIONS
+from torchrl_l1.dynamics.imagination import RewardFunction, Termination
 from torchrl_l1.dynamics.transitions import split_validation
 from torchrl_l1.envs import AnyTask, ExternalTask, StartStates, Task, action_bounds, load_attribute
 
@@ -47,8 +48,6 @@ OUTCOME_METRICS: dict[str, str] = {
     "out of training that it calls terminal.",
 }
 """What the fits of learned rewards and terminations report."""
-
-Termination = Callable[[Tensor], Tensor]
 
 
 @dataclass
@@ -147,11 +146,11 @@ class Outcomes:
             "elites": None,
         }
         self.fit_config = replace(fit or FitConfig(), **alone)
-        self.seed, self.device = seed, torch.device(device)
+        self.task, self.seed, self.device = task, seed, torch.device(device)
         self.models: dict[str, RewardModel | TerminationModel] = {}
         n, m = task.observation_dim, task.action_dim
         networks = vars(config or OutcomeConfig())
-        self.reward: Callable[[Tensor, Tensor, Tensor], Tensor]
+        self.reward: RewardFunction
         self._termination: Termination | None = None
         self.own_termination = termination == "builtin"
         with self._stream("initialisation"):
@@ -181,13 +180,15 @@ class Outcomes:
         """Whether data must say where episodes terminated."""
         return "termination_model" in self.models
 
-    def terminated(self, builtin: Termination | None) -> Termination | None:
+    def termination(self, as_task: bool = True) -> Termination | None:
         """What ends imagined trajectories; nothing does if ``None``.
 
         Args:
-            builtin: what the algorithm takes of its task, if it is to.
+            as_task: whether they end as the task does, where ``termination`` is ``builtin``.
         """
-        return builtin if self.own_termination else self._termination
+        if not self.own_termination:
+            return self._termination
+        return self.task.terminated if as_task and self.task.terminates else None
 
     def fit(self, buffer: ReplayBuffer, action_key: str, iteration: int) -> dict[str, float]:
         """Fit what is learned to all data, from the weights that it has; returns its metrics.

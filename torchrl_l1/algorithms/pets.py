@@ -82,7 +82,6 @@ class PETS(Algorithm):
             make_sampler(
                 config,
                 self.dynamics,
-                self.task,
                 self.outcomes,
                 common_noise=config.common_noise,
             ),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from torchrl_l1.algorithms.config import ModelConfig, check_plans
+from torchrl_l1.algorithms.config import LABELS, ModelConfig, check_planning
 from torchrl_l1.checks import (
     check_choice,
     check_counts,
@@ -70,13 +70,13 @@ class PETSConfig:
     fit: FitConfig = field(default_factory=FitConfig)
 
     def __post_init__(self) -> None:
-        check_choice("label", self.label, ("nominal", "executed"))
+        check_choice("label", self.label, tuple(LABELS))
         counts = ("outer_iterations", "random_episodes", "episodes_per_iteration", "fit_every")
         check_counts(self, *counts)
         check_not_negative("evaluation_episodes", self.evaluation_episodes)
         check_optional_count("episode_steps", self.episode_steps)
         check_optional_count("random_steps", self.random_steps)
-        check_plans(self, "cem", self.cem.horizon)
+        check_planning(self, "cem", self.cem.horizon)
 
     def collected_episodes(self, iterations: int) -> int:
         """Real episodes of so many outer iterations; random data do not count."""

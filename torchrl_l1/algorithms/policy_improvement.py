@@ -129,7 +129,7 @@ class PolicyImprovement:
             config.imagined_horizon,
             self.action_low,
             self.action_high,
-            self.outcomes.terminated(self._own_termination()),
+            self.outcomes.termination(config.imagined_termination),
             precision=config.precision,  # type: ignore[arg-type]
         )
         if self.penalize is not None:
@@ -156,10 +156,6 @@ class PolicyImprovement:
             imagined_return=rewards.sum(1).mean().item(),
             left_box=trajectories["next", "left_box"].any(1).float().mean().item(),
         )
-
-    def _own_termination(self) -> Callable[[Tensor], Tensor] | None:
-        own = self.config.imagined_termination and self.outcomes.own_termination
-        return self.task.terminated if own else None
 
     def _improve(self, observation: Tensor, action: Tensor, advantage: Tensor) -> TRPOReport:
         policy = self.policy

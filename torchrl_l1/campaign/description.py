@@ -22,6 +22,7 @@ from torchrl_l1.experiment.matrix import (
     conditions,
 )
 from torchrl_l1.experiment.recipes import find_campaign
+from torchrl_l1.experiment.settings import NAMING_KEYS
 
 
 class _Loader(yaml.SafeLoader):
@@ -106,7 +107,6 @@ def dump_yaml(content: Any) -> str:
 _PLAIN = re.compile(r"[A-Za-z0-9_.+-]{1,100}")
 # Names of environments and functions; in a path, underscores stand for what separates folders.
 _NAME_OF_CODE = re.compile(r"[A-Za-z0-9_.+:/-]{1,200}")
-_NAMING = ("task", "reward", "termination")
 # Keys too; a group may be below another one.
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:[./@-][A-Za-z0-9_]+)*")
 # Of a campaign, whose default is that of a user's file.
@@ -142,7 +142,7 @@ class RunMatrix:
             _check_list(f"matrix.{key}", values, (str, int, float), filled=True)
             texts = [value_text(value) for value in values]
             for text in texts:
-                if not (_NAME_OF_CODE if key in _NAMING else _PLAIN).fullmatch(text):
+                if not (_NAME_OF_CODE if key in NAMING_KEYS else _PLAIN).fullmatch(text):
                     raise CampaignError(
                         f"matrix.{key}: {text!r} cannot name a folder; give a word or a number, "
                         "and move what all runs share to overrides"

@@ -1,4 +1,4 @@
-"""The command ``torchrl-l1``: run, campaign, evaluate, robustify, play, export, report, verify."""
+"""The command ``torchrl-l1``: its subcommands, and how their errors are told."""
 
 from __future__ import annotations
 

@@ -19,8 +19,8 @@ from torchrl_l1.control.jacobian import ActionJacobian, DynamicsModel
 from torchrl_l1.control.law import step
 from torchrl_l1.control.least_squares import solve_matched
 from torchrl_l1.control.oracle import OracleTransform
-from torchrl_l1.control.pipeline import repeats, time_step
 from torchrl_l1.control.state import L1Diagnostics, L1State, ResidualStatistics, init
+from torchrl_l1.control.step_time import repeats, time_step
 from torchrl_l1.control.transform import L1Transform
 
 __all__ = [

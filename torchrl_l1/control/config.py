@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, Literal, get_args
 
 import torch
@@ -310,6 +310,19 @@ class L1Config:
                     f"{name} has {len(value)} entries, expected one number or {width} "
                     f"(observation width {observation_dim}, action width {action_dim})"
                 )
+
+
+def with_open_bounds(config: L1Config, low: Scalars | None, high: Scalars | None) -> L1Config:
+    """The settings with those action bounds filled that they leave open, as from an action spec.
+
+    Args:
+        config: the settings, whose own bounds go first.
+        low: lower bound; ``None`` leaves it open.
+        high: upper bound, likewise.
+    """
+    low = low if config.action_low is None else config.action_low
+    high = high if config.action_high is None else config.action_high
+    return replace(config, action_low=low, action_high=high)
 
 
 def _adaptation_gain(rate: float, dt: float) -> float:

@@ -17,7 +17,7 @@ from torchrl.envs.transforms import TensorDictPrimer, Transform
 
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control.affine import StepFunction, make_step
-from torchrl_l1.control.config import L1Config, Scalars
+from torchrl_l1.control.config import L1Config, Scalars, with_open_bounds
 from torchrl_l1.control.jacobian import Predicts
 from torchrl_l1.control.layout import (
     L1_KEY,
@@ -34,7 +34,6 @@ from torchrl_l1.control.pipeline import (
     Settings,
     carry,
     chain_of,
-    check_time_step,
     leaf_spec,
     unspecified,
     warn_of_surroundings,
@@ -42,6 +41,7 @@ from torchrl_l1.control.pipeline import (
 )
 from torchrl_l1.control.seal import SEAL, Emitted, sealed
 from torchrl_l1.control.state import L1Diagnostics, L1State, state_names
+from torchrl_l1.control.step_time import check_time_step
 
 
 class _Environment:
@@ -61,13 +61,8 @@ class _Environment:
         """The settings, with open bounds filled."""
         config = self.settings.config
         if self._filled is None or self._filled[0] is not config:
-            self._filled = config, self._fill(config)
+            self._filled = config, with_open_bounds(config, self.low, self.high)
         return self._filled[1]
-
-    def _fill(self, config: L1Config) -> L1Config:
-        low = self.low if config.action_low is None else config.action_low
-        high = self.high if config.action_high is None else config.action_high
-        return replace(config, action_low=low, action_high=high)
 
     def learn(self, low: Scalars | None, high: Scalars | None) -> None:
         """Take the bounds of an environment.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 import torch
@@ -15,7 +15,7 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_l1.control.affine import StepFunction
-from torchrl_l1.control.config import L1Config, Scalars
+from torchrl_l1.control.config import L1Config, Scalars, with_open_bounds
 from torchrl_l1.control.jacobian import ActionJacobian, ChangeFunction, DynamicsModel, Predicts
 from torchrl_l1.control.seal import SEAL, Emitted, seal_width, verify
 from torchrl_l1.control.state import L1Diagnostics, L1State, init
@@ -92,9 +92,7 @@ class Layout:
 
     def bounded(self, config: L1Config) -> L1Config:
         """The configuration with open action bounds filled from the action spec."""
-        low = self.low if config.action_low is None else config.action_low
-        high = self.high if config.action_high is None else config.action_high
-        return replace(config, action_low=low, action_high=high)
+        return with_open_bounds(config, self.low, self.high)
 
     def state_spec(self, config: L1Config) -> Composite:
         """Spec of an :class:`~torchrl_l1.control.L1State` with these settings, and of its seal."""

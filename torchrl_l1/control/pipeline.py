@@ -1,18 +1,18 @@
-"""What L1 asks of the pipeline around it: the order of transforms, the time step, its settings."""
+"""What L1 asks of the pipeline around it: the order of transforms, and settings that are open."""
 
 from __future__ import annotations
 
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import nn
 from torchrl.data import Composite, TensorSpec
-from torchrl.envs import EnvBase, PendulumEnv, SerialEnv, TransformedEnv
+from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import (
     Compose,
     DeviceCastTransform,
@@ -25,12 +25,13 @@ from torchrl.envs.transforms import (
     VecNormV2,
 )
 
-from torchrl_l1.control.config import L1Config, Scalars
-
-# Wrappers of Gymnasium that repeat an action keep the number under one of these, by custom.
-_REPEATS = ("_skip", "skip", "_frame_skip", "frame_skip", "action_repeat")
+from torchrl_l1.control.config import L1Config, Scalars, with_open_bounds
+from torchrl_l1.control.step_time import time_step
 
 _TOLERANCE = 1e-4
+
+# In place of a time step that is not known yet: so short that no setting is too fast for it.
+_SHORT = 1e-6
 
 
 def chain_of(transform: Transform) -> list[Transform]:
@@ -165,100 +166,6 @@ def carry(
         following.set((key, name), value)
 
 
-def time_step(env: EnvBase) -> float | None:
-    """Time of one step of an environment in seconds; ``None`` where it does not tell.
-
-    Read from: an attribute ``dt`` of the environment or of its ``task``, of the Gymnasium
-    environment inside, ``control_timestep`` of dm_control; times the frames that wrappers and
-    transforms skip. Environments in other processes are not asked.
-
-    Examples:
-        >>> from torchrl.envs import GymEnv
-        >>> time_step(GymEnv("Pendulum-v1", frame_skip=2))
-        0.1
-    """
-    if isinstance(env, TransformedEnv):
-        inner = time_step(env.base_env)
-        for transform in _flatten(env.transform):
-            if inner is not None and isinstance(transform, FrameSkipTransform):
-                inner *= transform.frame_skip
-        return inner
-    if isinstance(env, SerialEnv):
-        members = env.__dict__.get("_envs", [])
-        found = {time_step(member) for member in members}
-        return found.pop() if len(found) == 1 else None
-    if isinstance(env, PendulumEnv):
-        return float(env.gen_params()["params", "dt"])
-    wrapped = env.__dict__.get("_env", None)
-    if wrapped is None:
-        return _told(env)
-    inner = _of_wrapped(wrapped)
-    return None if inner is None else inner * getattr(env, "wrapper_frame_skip", 1)
-
-
-def _of_wrapped(env: Any) -> float | None:
-    control_timestep = getattr(env, "control_timestep", None)
-    if callable(control_timestep):
-        return _number(control_timestep())
-    vector = getattr(env, "envs", None)
-    if isinstance(vector, (list, tuple)) and vector:
-        return _of_wrapped(vector[0])
-    frames = 1
-    while getattr(env, "env", None) is not None and hasattr(env, "unwrapped"):
-        if env is env.unwrapped:
-            break
-        frames *= repeats(env)
-        env = env.env
-    told = _told(env)
-    return None if told is None else told * frames
-
-
-def repeats(wrapper: Any) -> int:
-    """How often a wrapper of Gymnasium repeats an action, by the attribute that is customary.
-
-    Examples:
-        >>> from types import SimpleNamespace
-        >>> repeats(SimpleNamespace(frame_skip=4)), repeats(SimpleNamespace())
-        (4, 1)
-    """
-    skips = [wrapper.__dict__.get(name) for name in _REPEATS]
-    return next((skip for skip in skips if type(skip) is int and skip > 0), 1)
-
-
-def _told(env: Any) -> float | None:
-    try:
-        dt = getattr(env, "dt", None)
-        return _number(getattr(getattr(env, "task", None), "dt", None) if dt is None else dt)
-    except Exception:  # an environment's own attributes may fail as they like
-        return None
-
-
-def _number(value: Any) -> float | None:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        return None
-    return number if math.isfinite(number) and number > 0 else None
-
-
-def check_time_step(owner: str, dt: float, env: EnvBase) -> bool:
-    """Refuse a ``dt`` that is not the environment's.
-
-    Returns:
-        whether the environment told its own.
-
-    Raises:
-        ValueError: naming both.
-    """
-    told = time_step(env)
-    if told is not None and abs(dt - told) > _TOLERANCE * told:
-        raise ValueError(
-            f"{owner} has dt={dt:.6g}, but a step of the environment takes {told:.6g} s: leave dt "
-            "out or give that, or check_dt=False if the environment is wrong"
-        )
-    return told is not None
-
-
 class Settings:
     """What a face of L1 was told, of which an environment may add the time step.
 
@@ -304,29 +211,18 @@ class Settings:
         if not self.is_complete:
             dt = time_step(env)
             if dt is None:
-                raise ValueError(self.missing)
+                raise ValueError(
+                    f"{self.owner} needs dt, the time of one environment step in seconds: the "
+                    "environment does not tell it"
+                )
             self.config = L1Config(dt, **self._others)
             self.is_complete = True
         return self.config
 
     def bound(self, low: Scalars | None, high: Scalars | None) -> None:
         """Fill action bounds that are open."""
-        config = self.config
-        low = low if config.action_low is None else config.action_low
-        high = high if config.action_high is None else config.action_high
-        self.config = replace(config, action_low=low, action_high=high)
-        self._others |= {"action_low": low, "action_high": high}
-
-    @property
-    def missing(self) -> str:
-        """What to say where the time step is not known."""
-        return (
-            f"{self.owner} needs dt, the time of one environment step in seconds: the environment "
-            "does not tell it"
-        )
-
-
-_SHORT = 1e-6
+        config = self.config = with_open_bounds(self.config, low, high)
+        self._others |= {"action_low": config.action_low, "action_high": config.action_high}
 
 
 def leaf_spec(spec: TensorSpec) -> TensorSpec:

@@ -30,13 +30,13 @@ from torchrl_l1.control.pipeline import (
     Settings,
     carry,
     check_order,
-    check_time_step,
     unspecified,
     warn_of_surroundings,
     widen_selection,
 )
 from torchrl_l1.control.seal import SEAL, Emitted, sealed
 from torchrl_l1.control.state import L1Diagnostics, L1State, state_names
+from torchrl_l1.control.step_time import check_time_step
 
 
 @dataclass

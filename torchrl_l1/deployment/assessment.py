@@ -23,7 +23,7 @@ from torchrl_l1.envs import DISTURBANCES, SUITES, EnvironmentSource, suite
 from torchrl_l1.experiment.l1_options import OFF, UNTUNED
 from torchrl_l1.experiment.matrix import disturbance_words, disturbed
 from torchrl_l1.report.page import markdown
-from torchrl_l1.report.recovery import recovered_text, recovery_columns
+from torchrl_l1.report.recovery import controllers, recovered_text, recovery_columns
 from torchrl_l1.report.style import arm_label, color, fit_scale, grid, legend_below, save
 
 Disturbances: TypeAlias = str | Mapping[str, float | Sequence[float]]
@@ -34,8 +34,8 @@ Row = dict[str, Any]
 _ONLY = "the episodes of one policy"
 
 
-def disturbance_cells(disturbances: Disturbances) -> list[dict[str, float]]:
-    """The cells of a test: undisturbed first, then each value of each disturbance by itself, once.
+def single_disturbances(disturbances: Disturbances) -> list[dict[str, float]]:
+    """What is tested: undisturbed first, then each value of each disturbance by itself, once.
 
     Args:
         disturbances: a suite of :func:`~torchrl_l1.envs.suite`, or values by name.
@@ -44,7 +44,7 @@ def disturbance_cells(disturbances: Disturbances) -> list[dict[str, float]]:
         ValueError: for a disturbance or suite that there is not, or a value that it cannot have.
 
     Examples:
-        >>> disturbance_cells({"bias": [0.0, 0.5], "gain": 0.6})
+        >>> single_disturbances({"bias": [0.0, 0.5], "gain": 0.6})
         [{}, {'bias': 0.5}, {'gain': 0.6}]
     """
     if isinstance(disturbances, str):
@@ -153,7 +153,7 @@ class Assessment(Sequence[Row]):
     @property
     def controllers(self) -> list[str]:
         """The controllers in the order of the columns, the oracle last."""
-        return sorted(dict.fromkeys(row["l1"] for row in self.rows), key=lambda l1: l1 == ORACLE)
+        return controllers(self.rows)
 
     def __str__(self) -> str:
         lines = []
@@ -306,7 +306,7 @@ def assess(
         on_cell: called with the number of all cells after each, for progress bars.
         heading: of the chart.
     """
-    cells = disturbance_cells(disturbances)
+    cells = single_disturbances(disturbances)
     if isinstance(disturbances, str):
         cells = [cell for cell in cells if all(source.takes(DISTURBANCES[name]) for name in cell)]
     names = list(dict.fromkeys(name for cell in cells for name in cell))

@@ -16,17 +16,23 @@ from torchrl_l1.checks import check_count
 from torchrl_l1.dynamics.model import EnsembleDynamics
 from torchrl_l1.dynamics.network import ForwardPass, PlanningNetwork, Precision
 
+RewardFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Observation ``(..., n)``, action ``(..., m)`` and next observation to rewards ``(...)``."""
+
+Termination = Callable[[Tensor], Tensor]
+"""Next observation ``(..., n)`` to whether the task ends there ``(...)``, bool."""
+
 
 @torch.no_grad()
 def imagine(
     dynamics: EnsembleDynamics,
     policy: Callable[[Tensor], Tensor],
-    reward: Callable[[Tensor, Tensor, Tensor], Tensor],
+    reward: RewardFunction,
     start: Tensor,
     horizon: int,
     action_low: Tensor,
     action_high: Tensor,
-    terminated: Callable[[Tensor], Tensor] | None = None,
+    terminated: Termination | None = None,
     precision: Precision = "float32",
 ) -> TensorDict:
     """Roll a policy out in the ensemble, one random member per step for the whole batch.
@@ -158,9 +164,6 @@ def _forward_pass(
     rows = [0] * network.members
     rows[member] = batch
     return ForwardPass(network, rows, memory=memory)
-
-
-RewardFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 class EnsembleWorldModel(TensorDictModuleBase):

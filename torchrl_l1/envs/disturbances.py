@@ -232,7 +232,7 @@ class HeldDisturbance(EnvironmentTransform):
         if where is not None:
             chosen = where.reshape(*batch, -1).any(-1)
             state = {
-                name: torch.where(_right(chosen, new), new, self._state[name])
+                name: torch.where(_with_axes_of(new, chosen), new, self._state[name])
                 if name in self._state and self._state[name].shape == new.shape
                 else new
                 for name, new in state.items()
@@ -266,7 +266,8 @@ class HeldDisturbance(EnvironmentTransform):
         return f"{type(self).__name__}({value}, key={self.key!r})"
 
 
-def _right(mask: Tensor, entry: Tensor) -> Tensor:
+def _with_axes_of(entry: Tensor, mask: Tensor) -> Tensor:
+    """A mask of the batch with further axes at its end, to be broadcast to an entry."""
     return mask.reshape(*mask.shape, *(1,) * (entry.ndim - mask.ndim))
 
 

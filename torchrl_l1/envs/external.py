@@ -12,15 +12,21 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Bounded
 from torchrl.envs import EnvBase, GymEnv, GymWrapper
 
 from torchrl_l1.checks import check_optional_count
-from torchrl_l1.envs.cells import PAGE, Cell, GymnasiumCell, TorchRLCell
 from torchrl_l1.envs.known_rewards import Outcome
-from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv, keep_others, stepped_rows
-from torchrl_l1.envs.plant import Plant, disturbed_model
+from torchrl_l1.envs.mujoco_env import (
+    BatchedMujocoEnv,
+    declare_specs,
+    keep_others,
+    reset_rows,
+    stepped_rows,
+)
+from torchrl_l1.envs.plant import Plant, cannot_change, disturbed_model, survives_resets
 from torchrl_l1.envs.references import making
+from torchrl_l1.envs.single import PAGE, SingleEnv, SingleGymnasiumEnv, SingleTorchRLEnv
 from torchrl_l1.envs.sources import EnvironmentSource, environment_source
 from torchrl_l1.envs.task import BadAction, RewardFn, Scalars, Task
 
@@ -66,28 +72,28 @@ class ExternalTask:
         self.source, self.name = source, source.name or "the environment"
         self._keys = tuple(observation_keys)
         check_optional_count("horizon", horizon)
-        cell = self._cell()
+        single = self._single()
         try:
-            self.observation_dim = cell.observation_dim
-            self.action_dim = len(cell.low)
-            self.action_low, self.action_high = _scalars(cell.low), _scalars(cell.high)
-            self.dt = self._told("dt", "SECONDS", "how long a step takes", dt, cell.time_step())
+            self.observation_dim = single.observation_dim
+            self.action_dim = len(single.low)
+            self.action_low, self.action_high = _scalars(single.low), _scalars(single.high)
+            self.dt = self._told("dt", "SECONDS", "how long a step takes", dt, single.time_step())
             if dt is not None and abs(dt - self.dt) > 1e-6 * self.dt:
                 raise ValueError(f"dt: a step of {self.name} takes {self.dt:g} s, not {dt:g}")
             self.horizon = horizon or self._told(
-                "horizon", "STEPS", "how long an episode is", None, cell.horizon()
+                "horizon", "STEPS", "how long an episode is", None, single.horizon()
             )
-            self.outcome = cell.outcome()
-            self.has_plant = cell.simulation() is not None
+            self.outcome = single.outcome()
+            self.has_plant = single.simulation() is not None
         finally:
-            cell.close()
+            single.close()
 
     def _told(self, key: str, unit: str, what: str, given: Any, told: Any) -> Any:
         if told is None and given is None:
             raise ValueError(f"{self.name} does not tell {what}: give {key}={unit} ({PAGE})")
         return given if told is None else told
 
-    def _cell(self, limited: bool = True) -> Cell:
+    def _single(self, limited: bool = True) -> SingleEnv:
         """One environment, by itself.
 
         Args:
@@ -97,12 +103,12 @@ class ExternalTask:
             options: dict[str, Any] = {} if limited else {"max_episode_steps": -1}
             with making(self.name):
                 made = gymnasium.make(self.source.gymnasium_id, disable_env_checker=True, **options)
-            return GymnasiumCell(made, self.name, self._keys)
+            return SingleGymnasiumEnv(made, self.name, self._keys)
         env = self.source.build()
         plain = type(env) in (GymEnv, GymWrapper) and getattr(env, "wrapper_frame_skip", 1) == 1
         if plain and isinstance(env._env, gymnasium.Env):
-            return GymnasiumCell(env._env, self.name, self._keys)
-        return TorchRLCell(env, self.name, self._keys)
+            return SingleGymnasiumEnv(env._env, self.name, self._keys)
+        return SingleTorchRLEnv(env, self.name, self._keys)
 
     @property
     def imagined_reward(self) -> RewardFn:
@@ -150,12 +156,8 @@ class ExternalTask:
             ValueError: naming the disturbance.
         """
         for name in names:
-            if not self.has_plant or name == "wind":  # which Gymnasium's resets would undo
-                raise ValueError(
-                    f"{name} changes the plant, which needs a task of ours or one of Gymnasium's "
-                    f"MuJoCo environments{' and no wind' * (name == 'wind')}, not {self.name}: "
-                    "leave it out"
-                )
+            if not (self.has_plant and survives_resets(name)):
+                raise ValueError(cannot_change(self.name, name))
 
     def environment(self, num_envs: int, **settings: Any) -> ExternalEnv:
         """So many environments side by side, see :class:`ExternalEnv`."""
@@ -215,30 +217,18 @@ class ExternalEnv(EnvBase):
         super().__init__(device="cpu", batch_size=[num_envs])
         self.task, self.num_envs, self.max_steps, self._dtype = task, num_envs, max_steps, dtype
         task.check_disturbances(list(plant or {}))
-        self.cells = [task._cell(limited=False) for _ in range(num_envs)]
-        self._models = [cell.simulation().model for cell in self.cells if plant]
+        self.members = [task._single(limited=False) for _ in range(num_envs)]
+        self._models = [member.simulation().model for member in self.members if plant]
         self._plant = Plant(self._models[0], num_envs, plant) if plant else None
         self._change_plant(np.arange(num_envs))
-        self._low = np.stack([cell.low for cell in self.cells])
-        self._high = np.stack([cell.high for cell in self.cells])
+        self._low = np.stack([member.low for member in self.members])
+        self._high = np.stack([member.high for member in self.members])
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._observation = np.zeros((num_envs, task.observation_dim), dtype=np.float32)
-        self._make_specs()
-        self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
-
-    def _make_specs(self) -> None:
-        batch, dtype = self.batch_size, self._dtype
-        self.observation_spec = Composite(
-            observation=Unbounded((*batch, self.task.observation_dim), dtype=dtype),
-            non_finite=Binary(shape=(*batch, 1), dtype=torch.bool),
-            shape=batch,
-        )
         low, high = (torch.from_numpy(bound).to(dtype) for bound in (self._low, self._high))
-        self.action_spec = Bounded(low, high, low.shape, dtype=dtype)
-        self.reward_spec = Unbounded((*batch, 1), dtype=dtype)
-        flags = ("done", "terminated", "truncated")
-        flag = Binary(shape=(*batch, 1), dtype=torch.bool)
-        self.full_done_spec = Composite({key: flag.clone() for key in flags}, shape=batch)
+        action_spec = Bounded(low, high, low.shape, dtype=dtype)
+        declare_specs(self, task.observation_dim, action_spec, dtype)
+        self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
 
     def _set_seed(self, seed: int | None) -> None:
         self._rng = np.random.default_rng(seed)
@@ -248,21 +238,18 @@ class ExternalEnv(EnvBase):
         for index in indices if values else ():
             changes = {name: float(each[index]) for name, each in values.items()}
             changed = disturbed_model(self._models[index], changes)
-            self.cells[index].simulation().model = changed
+            self.members[index].simulation().model = changed
 
     def _emitted(self) -> Tensor:
         return torch.from_numpy(self._observation.copy()).to(self._dtype)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        indices = np.arange(self.num_envs)
-        if mask is not None:
-            indices = np.flatnonzero(mask.reshape(self.num_envs, -1).any(-1).numpy())
+        indices = reset_rows(tensordict, self.num_envs)
         if self._plant is not None and self._plant.is_drawn:
             self._plant.redraw(indices)
             self._change_plant(indices)
         for index in indices:
-            self._observation[index] = self.cells[index].reset(int(self._rng.integers(2**31)))
+            self._observation[index] = self.members[index].reset(int(self._rng.integers(2**31)))
         self._steps[indices] = 0
         return self._data({}, *(np.zeros(self.num_envs, dtype=bool) for _ in range(3)))
 
@@ -276,7 +263,7 @@ class ExternalEnv(EnvBase):
         reward = np.zeros(self.num_envs, dtype=np.float32)
         bad, terminated, truncated = (np.zeros(self.num_envs, dtype=bool) for _ in range(3))
         for index in np.flatnonzero(chosen):
-            stepping = self.cells[index].step(actions[index])
+            stepping = self.members[index].step(actions[index])
             observation, earned, terminated[index], truncated[index] = stepping
             bad[index] = not (np.isfinite(observation).all() and np.isfinite(earned))
             if not bad[index]:
@@ -309,8 +296,8 @@ class ExternalEnv(EnvBase):
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Free all environments."""
-        for cell in self.cells:
-            cell.close()
+        for member in self.members:
+            member.close()
         super().close(raise_if_closed=raise_if_closed)
 
 

@@ -18,6 +18,38 @@ from torchrl_l1.envs.task import Task
 from torchrl_l1.envs.tasks import built_in_task
 
 
+def declare_specs(
+    env: EnvBase, observation_dim: int, action_spec: Bounded, dtype: torch.dtype
+) -> None:
+    """Say what a batch of environments takes and gives: what all of ours have in common.
+
+    Args:
+        env: its batch size is set.
+        observation_dim: width of the observation.
+        action_spec: of the action.
+        dtype: of observation and reward.
+    """
+    batch = env.batch_size
+    flag = Binary(shape=(*batch, 1), dtype=torch.bool)
+    env.observation_spec = Composite(
+        observation=Unbounded((*batch, observation_dim), dtype=dtype),
+        non_finite=flag.clone(),
+        shape=batch,
+    )
+    env.action_spec = action_spec
+    env.reward_spec = Unbounded((*batch, 1), dtype=dtype)
+    flags = ("done", "terminated", "truncated")
+    env.full_done_spec = Composite({key: flag.clone() for key in flags}, shape=batch)
+
+
+def reset_rows(tensordict: TensorDictBase | None, num_envs: int) -> np.ndarray:
+    """Indices of the environments that a ``"_reset"`` mask names; all where there is no mask."""
+    mask = None if tensordict is None else tensordict.get("_reset", None)
+    if mask is None:
+        return np.arange(num_envs)
+    return np.flatnonzero(mask.reshape(num_envs, -1).any(-1).numpy())
+
+
 def stepped_rows(tensordict: TensorDictBase, num_envs: int) -> Tensor | None:
     """Which environments a ``"_step"`` mask lets step ``(N,)``; ``None`` where there is no mask."""
     mask = tensordict.get("_step", None)
@@ -103,27 +135,11 @@ class BatchedMujocoEnv(EnvBase):
         self._dtype = dtype
         self._simulation = TaskSimulation(task, num_envs, threads, plant)
         self._steps = np.zeros(num_envs, dtype=np.int64)
-        self._make_specs()
+        action_spec = Bounded(
+            task.action_low, task.action_high, (num_envs, task.action_dim), dtype=dtype
+        )
+        declare_specs(self, task.observation_dim, action_spec, dtype)
         self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
-
-    def _make_specs(self) -> None:
-        batch, task, dtype = self.batch_size, self.task, self._dtype
-        self.observation_spec = Composite(
-            observation=Unbounded((*batch, task.observation_dim), dtype=dtype),
-            non_finite=Binary(shape=(*batch, 1), dtype=torch.bool),
-            shape=batch,
-        )
-        self.action_spec = Bounded(
-            task.action_low, task.action_high, (*batch, task.action_dim), dtype=dtype
-        )
-        self.reward_spec = Unbounded((*batch, 1), dtype=dtype)
-        self.full_done_spec = Composite(
-            {
-                key: Binary(shape=(*batch, 1), dtype=torch.bool)
-                for key in ("done", "terminated", "truncated")
-            },
-            shape=batch,
-        )
 
     @property
     def model(self) -> mujoco.MjModel:
@@ -167,11 +183,7 @@ class BatchedMujocoEnv(EnvBase):
         self._rng = np.random.default_rng(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is None:
-            indices = np.arange(self.num_envs)
-        else:
-            indices = np.flatnonzero(mask.reshape(self.num_envs, -1).any(-1).numpy())
+        indices = reset_rows(tensordict, self.num_envs)
         self._simulation.reset(self._rng, indices)
         self._steps[indices] = 0
         # Environments outside the mask keep their own entries: TorchRL merges by the mask.

@@ -120,6 +120,19 @@ def check_plant(name: str, value: float) -> None:
         raise ValueError(f"{name} {_CHANGES[name].rule}, got {value}")
 
 
+def survives_resets(name: str) -> bool:
+    """Whether a change outlasts Gymnasium's resets, which take the force of a wind away."""
+    return name != _WIND
+
+
+def cannot_change(environment: str, name: str) -> str:
+    """What to say of a change of the plant that an environment of elsewhere cannot be given."""
+    return (
+        f"{name} changes the plant, which needs a task of ours or one of Gymnasium's MuJoCo "
+        f"environments{' and no wind' * (name == _WIND)}, not {environment}: leave it out"
+    )
+
+
 def disturbed_model(
     model: mujoco.MjModel, changes: Mapping[str, float], body: str | int | None = None
 ) -> mujoco.MjModel:

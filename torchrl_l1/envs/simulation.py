@@ -110,7 +110,7 @@ class BatchedSimulator:
                 raise ValueError(f"{name} has entries that are not finite")
         self._renew_plant(chosen)
         self.batch.reset(chosen, stage=_NO_STAGE)
-        self._blow(chosen)
+        self._apply_wind(chosen)
         self.qpos[chosen] = qpos
         self.qvel[chosen] = qvel
         self.batch.forward(chosen)
@@ -120,7 +120,7 @@ class BatchedSimulator:
             self.plant.redraw(chosen)
             self.batch.set_models(self.plant.models())
 
-    def _blow(self, chosen: np.ndarray) -> None:
+    def _apply_wind(self, chosen: np.ndarray) -> None:
         # Forces are part of the state, which a reset clears.
         forces = None if self.plant is None else self.plant.forces()
         if forces is not None:

@@ -35,7 +35,7 @@ from torchrl_l1.envs.perturbations import (
     active_disturbances,
     disturbance_transforms,
 )
-from torchrl_l1.envs.plant import disturbed_model
+from torchrl_l1.envs.plant import cannot_change, disturbed_model, survives_resets
 from torchrl_l1.envs.references import find_attribute, load_module, making, require
 from torchrl_l1.envs.task import Task
 from torchrl_l1.envs.tasks import TASKS
@@ -126,10 +126,7 @@ class EnvironmentSource:
     def _checked(self, disturbances: Mapping[str, float]) -> dict[str, Any]:
         for name in disturbances:
             if not self.takes(DISTURBANCES[name]):
-                raise ValueError(
-                    f"{name} changes the plant, which needs a task of ours or one of Gymnasium's "
-                    f"MuJoCo environments, not {self.name or 'a function'}: leave it out"
-                )
+                raise ValueError(cannot_change(self.name or "a function", name))
         return dict(disturbances)
 
     def _changed(self, disturbances: Mapping[str, float], **options: Any) -> EnvBase:
@@ -144,8 +141,7 @@ class EnvironmentSource:
         """Whether a disturbance can act on it."""
         if not _of_plant(disturbance) or self.task is not None:
             return True
-        # The force of a wind does not survive Gymnasium's resets.
-        return disturbance.name != "wind" and simulation_of(self.build()) is not None
+        return survives_resets(disturbance.name) and simulation_of(self.build()) is not None
 
     def time_step(self) -> float | None:
         """Time of one environment step in seconds, as far as the environment tells."""

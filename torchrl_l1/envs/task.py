@@ -36,8 +36,9 @@ def never(next_observation: Tensor) -> Tensor:
 class AnyTask(Protocol):
     """What algorithms need to know of a task: one of ours, or an environment of elsewhere.
 
-    :class:`Task` and :class:`ExternalTask` are such. Bounds are one number, or one for each entry
-    of the action.
+    :class:`Task` and :class:`ExternalTask` are such; one of another class needs the ``environment``
+    of the latter, too, for :func:`make_env`. Bounds are one number, or one for each entry of the
+    action.
     """
 
     @property

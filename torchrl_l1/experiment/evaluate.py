@@ -112,7 +112,7 @@ def load_run(path: str | Path, *, last: bool = False) -> TrainedRun:
         with fitting_into_memory(str(path)):
             algorithm = replace(recipe, **here).build()
         load_state(algorithm, {**state, "buffer": {}}, directory.checkpoint_file)
-        _measure_residuals(algorithm, state.get("buffer", {}), recipe)
+        _measure_residuals(algorithm, state.get("buffer", {}))
     return TrainedRun(directory.path, recipe, algorithm, Path(path).stem if kept else "")
 
 
@@ -139,13 +139,13 @@ def _literal(value: Any) -> Any:
     return value
 
 
-def _measure_residuals(algorithm: Algorithm, buffer: dict[str, Any], recipe: RunSettings) -> None:
+def _measure_residuals(algorithm: Algorithm, buffer: dict[str, Any]) -> None:
     """From the run's own data, what training without a Kalman filter has not measured."""
     dynamics, task = algorithm.acting_dynamics, algorithm.task
     if not buffer:
         return
     data = TensorDict(buffer).auto_batch_size_(1)
-    action_key = "action" if getattr(recipe, "label", "nominal") == "nominal" else "executed"
+    action_key = algorithm.learning.action_key
     held_out = data[data["validation"].reshape(-1)]
     if not bool(dynamics.residuals.measured) and held_out.shape[0]:
         held_out = held_out.set("action", held_out[action_key])

@@ -190,11 +190,6 @@ def saved(state: object) -> bytes:
     return buffer.getvalue()
 
 
-def save_atomically(file: Path, state: object) -> None:
-    """Replace a ``torch.save`` file in one step."""
-    write_atomically(file, saved(state))
-
-
 def read_text(file: Path, most_bytes: int | None = None) -> str:
     """The text of a regular file: a pipe in its place would be waited for for ever.
 

@@ -39,7 +39,7 @@ from torchrl_l1.experiment.files import bounded_overrides, path_text
 
 @dataclass
 class L1Settings:
-    """The adaptive controller of a recipe.
+    """The adaptive controller of a recipe: settings of :class:`L1Config`, and two more.
 
     Attributes:
         enabled: whether L1 acts during collection.
@@ -56,8 +56,8 @@ class L1Settings:
         covariance: where it comes from: ``residuals``, ``heads``, ``disagreement`` or ``sum``.
         dead_zone: posterior standard deviations within which the Kalman filter does nothing.
         process_noise: change of the disturbance per step that it expects, fraction of half the
-            range of the action; 0.003 if null.
-        inflation: factor on the covariance; 1 if null.
+            range of the action; if null, what the model says of itself, or else 0.01.
+        inflation: factor on the covariance; if null, what the model says of itself, or else 1.
         initial_deviation: standard deviation of the disturbance at a reset, same units.
         forgetting: factor per step of the running estimate of each state's noise; 1 for none.
         compile: compile the controller's step: ``true``, ``false``, or ``auto`` where a compiler
@@ -82,6 +82,10 @@ class L1Settings:
     initial_deviation: float = 0.3
     forgetting: float = 0.97
     compile: bool | str = False
+
+
+# Of L1Settings, what is no setting of L1Config.
+_BESIDE_L1_CONFIG = ("enabled", "compile")
 
 
 @dataclass
@@ -310,27 +314,8 @@ def l1_config(settings: L1Settings, task: str | AnyTask) -> L1Config | None:
     if not settings.enabled:
         return None
     task = get_task(task)
-    return L1Config(
-        dt=task.dt,
-        epsilon=settings.epsilon,
-        alpha=settings.alpha,
-        cutoff=settings.cutoff,
-        a_s=settings.a_s,
-        on_switch=settings.on_switch,  # type: ignore[arg-type]
-        switch_on=settings.switch_on,  # type: ignore[arg-type]
-        filter_input=settings.filter_input,  # type: ignore[arg-type]
-        project=settings.project,
-        estimator=settings.estimator,  # type: ignore[arg-type]
-        filter=settings.filter,  # type: ignore[arg-type]
-        covariance=settings.covariance,  # type: ignore[arg-type]
-        dead_zone=settings.dead_zone,
-        process_noise=settings.process_noise,
-        inflation=settings.inflation,
-        initial_deviation=settings.initial_deviation,
-        forgetting=settings.forgetting,
-        action_low=task.action_low,
-        action_high=task.action_high,
-    )
+    own = {name: value for name, value in vars(settings).items() if name not in _BESIDE_L1_CONFIG}
+    return L1Config(task.dt, **own, action_low=task.action_low, action_high=task.action_high)
 
 
 # The algorithm's settings come first: they say how many outer iterations there are.

@@ -307,9 +307,8 @@ def reward_function(algorithm: Algorithm) -> Any:
 
 def termination_function(algorithm: Algorithm) -> tuple[bool, Any]:
     """Whether the termination of imagination is known, and the function, if there is one."""
-    task, outcomes = algorithm.task, algorithm.outcomes
-    builtin = task.terminated if outcomes.own_termination and task.terminates else None
-    return not outcomes.learns_terminations, outcomes.terminated(builtin)
+    outcomes = algorithm.outcomes
+    return not outcomes.learns_terminations, outcomes.termination()
 
 
 def failures(findings: Sequence[Finding]) -> int:

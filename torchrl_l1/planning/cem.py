@@ -102,7 +102,7 @@ def plan(
         tensor([ 0.5000, -0.2500])
     """
     low, high = checked_bounds(low, high, mean)
-    mean = torch.minimum(torch.maximum(checked_mean(mean, config.horizon), low), high)
+    mean = checked_mean(mean, config.horizon, low, high)
     variance = initial_variance(config.initial_variance, low, high, mean)
     best, best_return = mean, torch.full_like(mean[:, 0, 0], -torch.inf)
     unfinished = torch.ones_like(best_return, dtype=torch.bool)

@@ -76,7 +76,7 @@ def plan(
         tensor(True)
     """
     low, high = checked_bounds(low, high, mean)
-    mean = torch.minimum(torch.maximum(checked_mean(mean, config.horizon), low), high)
+    mean = checked_mean(mean, config.horizon, low, high)
     variance = initial_variance(config.variance, low, high, mean)
     best, best_return = mean, torch.full_like(mean[:, 0, 0], -torch.inf)
     for _ in range(config.iterations):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -17,7 +17,7 @@ from torchrl_l1.planning import cem, mppi, random_shooting
 from torchrl_l1.planning.cem import CEMConfig
 from torchrl_l1.planning.mppi import MPPIConfig
 from torchrl_l1.planning.random_shooting import ShootingConfig
-from torchrl_l1.planning.sequences import Plan, checked_bounds
+from torchrl_l1.planning.sequences import Plan, SequenceOptimizer, checked_bounds
 from torchrl_l1.planning.trajectory_sampling import TrajectorySampler
 
 OptimizerConfig = CEMConfig | MPPIConfig | ShootingConfig
@@ -25,7 +25,7 @@ OptimizerConfig = CEMConfig | MPPIConfig | ShootingConfig
 PLAN_KEY = "plan"
 """Default key of the nested tensordict that holds the planner's state."""
 
-_OPTIMIZERS: dict[type, Callable[..., Plan]] = {
+_OPTIMIZERS: dict[type[OptimizerConfig], SequenceOptimizer] = {
     CEMConfig: cem.plan,
     MPPIConfig: mppi.plan,
     ShootingConfig: random_shooting.plan,

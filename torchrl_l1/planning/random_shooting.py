@@ -64,7 +64,7 @@ def plan(
         tensor(True)
     """
     low, high = checked_bounds(low, high, mean)
-    mean = torch.minimum(torch.maximum(checked_mean(mean, config.horizon), low), high)
+    mean = checked_mean(mean, config.horizon, low, high)
     shape = (mean.shape[0], config.candidates, *mean.shape[1:])
     uniform = torch.rand(shape, dtype=mean.dtype, device=mean.device, generator=generator)
     sequences = low + uniform * (high - low)

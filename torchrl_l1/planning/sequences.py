@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -29,6 +29,24 @@ class Plan(NamedTuple):
     variance: Tensor
     best: Tensor
     best_return: Tensor
+
+
+class SequenceOptimizer(Protocol):
+    """What looks for the sequence of the highest return, such as ``plan_cem``.
+
+    Its settings tell the policy which one to use; they have a ``horizon`` and ``candidates``.
+    """
+
+    def __call__(
+        self,
+        evaluate: Evaluate,
+        mean: Tensor,
+        low: Tensor | float,
+        high: Tensor | float,
+        config: Any,
+        generator: torch.Generator | None = None,
+    ) -> Plan:
+        """See :func:`torchrl_l1.planning.cem.plan`."""
 
 
 def checked_bounds(
@@ -58,8 +76,8 @@ def checked_bounds(
     return bounds[0], bounds[1]
 
 
-def checked_mean(mean: Tensor, horizon: int) -> Tensor:
-    """The initial mean, which must be ``(N, H, m)``.
+def checked_mean(mean: Tensor, horizon: int, low: Tensor, high: Tensor) -> Tensor:
+    """The initial mean within the bounds; it must be ``(N, H, m)``.
 
     Raises:
         ValueError: for another shape.
@@ -69,7 +87,7 @@ def checked_mean(mean: Tensor, horizon: int) -> Tensor:
             f"mean must have shape (environments, {horizon}, actions) with the horizon of the "
             f"settings, got {tuple(mean.shape)}"
         )
-    return mean
+    return torch.minimum(torch.maximum(mean, low), high)
 
 
 def evaluated(evaluate: Evaluate, sequences: Tensor) -> Tensor:

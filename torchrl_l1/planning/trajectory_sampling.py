@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl_l1.checks import check_choice, check_count, check_optional_count, check_within
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.dynamics.imagination import RewardFunction, Termination
 from torchrl_l1.dynamics.network import (
     PlanningNetwork,
     Precision,
@@ -22,8 +23,6 @@ from torchrl_l1.planning.compiled_motion import compiled_predictor, resolve_comp
 from torchrl_l1.planning.particles import (
     Draws,
     Propagation,
-    RewardFunction,
-    Termination,
     imagined_returns,
     member_shares,
     predictor,

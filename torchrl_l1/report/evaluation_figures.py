@@ -17,6 +17,7 @@ from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.l1_options import controller_label
 from torchrl_l1.experiment.matrix import disturbed
 from torchrl_l1.report.identity import BASELINE
+from torchrl_l1.report.page import Row
 from torchrl_l1.report.study import noise_order
 from torchrl_l1.report.style import (
     arm_label,
@@ -28,8 +29,6 @@ from torchrl_l1.report.style import (
     save,
     title,
 )
-
-Row = Mapping[str, Any]
 
 L1_IN = ("neither", "training only", "testing only", "both")
 """Where L1 is on, in the order in which tables and figures show it."""

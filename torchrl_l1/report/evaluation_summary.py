@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Sequence
 from statistics import median
 from typing import Any
 
@@ -11,7 +11,7 @@ from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.l1_options import UNTUNED, controller_label
 from torchrl_l1.experiment.matrix import disturbance_words
 from torchrl_l1.report.identity import BASELINE
-from torchrl_l1.report.page import grouped, markdown
+from torchrl_l1.report.page import Row, grouped, markdown
 from torchrl_l1.report.recovery import (
     FEW_DISTURBANCES,
     controllers,
@@ -21,7 +21,6 @@ from torchrl_l1.report.recovery import (
 )
 from torchrl_l1.report.style import arm_label
 
-Row = Mapping[str, Any]
 Key = tuple[Any, ...]
 
 

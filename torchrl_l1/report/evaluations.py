@@ -22,6 +22,7 @@ from torchrl_l1.report.identity import BASELINE, facts
 from torchrl_l1.report.page import (
     Footnotes,
     Page,
+    Row,
     difference_text,
     grouped,
     markdown,
@@ -46,12 +47,14 @@ from torchrl_l1.report.statistics import difference_summary, mean_summary
 from torchrl_l1.report.study import Study, noise_order, variant_text
 from torchrl_l1.report.style import arm_label, named
 
-Row = Mapping[str, Any]
 Key = tuple[Any, ...]
 Section = Callable[[Page, AlgorithmFacts, Sequence[Row]], None]
 
 # Longer tables are left to their CSV.
 _MOST_ROWS = 160
+
+# Columns of what was measured, with the field of an evaluation that each shows and a factor.
+_MEANS = {"steps_mean": ("steps_mean", 1), "switches_per_1000_steps": ("switch_rate", 1000)}
 
 
 def evaluation_sections(page: Page, study: Study) -> None:
@@ -271,7 +274,7 @@ def evaluation_rows(study: Study, name: str) -> list[dict[str, Any]]:
     return rows
 
 
-def ablation_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def ablation_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Those rows of an evaluation that the ablation is made of, with the ``phase`` of L1.
 
     The test has the noise of the training and no disturbance, and L1 is on in both phases, in
@@ -322,12 +325,10 @@ def _summary(tests: Sequence[tuple[Run, Evaluation]]) -> dict[str, Any]:
         "return_values": " ".join(f"{value:.6g}" for value in values),
         **mean,
     }
-    steps = float(np.mean([test.steps_mean for _, test in tests]))
-    if np.isfinite(steps):
-        result["steps_mean"] = steps
-    switches = 1000 * float(np.mean([test.switch_rate for _, test in tests]))
-    if np.isfinite(switches):
-        result["switches_per_1000_steps"] = switches
+    for column, (field, factor) in _MEANS.items():
+        value = factor * float(np.mean([getattr(test, field) for _, test in tests]))
+        if np.isfinite(value):
+            result[column] = value
     return result
 
 

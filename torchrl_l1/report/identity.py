@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.control.config import DEFAULT_ALPHA
-from torchrl_l1.experiment.l1_options import closest_option, departures, filter_gain
+from torchrl_l1.experiment.l1_options import OFF, closest_option, departures, filter_gain
 from torchrl_l1.experiment.recipes import shared_dir
 from torchrl_l1.experiment.settings import (
     SCHEMAS,
@@ -35,7 +35,7 @@ ALGORITHMS: Mapping[str, AlgorithmFacts] = {
 }
 """By name, see :class:`Identity`, in the order in which a report shows them."""
 
-BASELINE = "off"
+BASELINE = OFF
 """Name of the arm without L1."""
 
 NOISES = ("none", "action", "observation", "both")

@@ -12,6 +12,7 @@ from torchrl_l1.experiment.files import bounded, write_table
 from torchrl_l1.report.style import named
 
 Row = Mapping[str, Any]
+"""A line of a table, by its columns."""
 
 
 class Page:

@@ -105,6 +105,10 @@ class Evaluation(Condition):
         return self.epsilon is not None or self.alpha is not None
 
 
+MEASURED: Mapping[str, str] = {"steps_mean": "steps_mean", "switch_rate": SWITCH_RATE}
+"""Fields of an :class:`Evaluation` that tables may lack, with the columns that they come from."""
+
+
 def condition_columns() -> tuple[str, ...]:
     """Names of the values of :attr:`Evaluation.condition`."""
     return "l1", "noise", *DISTURBANCES, "policy", "stage"
@@ -118,7 +122,7 @@ def read_evaluations(file: Path) -> list[Evaluation]:
     Raises:
         RunDirectoryError: if a file cannot be read, or says two things of one condition.
     """
-    optional = ("own_l1", SWITCH_RATE, "steps_mean")
+    optional = ("own_l1", *MEASURED.values())
     rows = _each_once(file, _condition_rows(file, ("return_mean", "episodes"), optional))
     singly: dict[tuple[Any, ...], list[float]] = {}
     episodes = episodes_file(file)
@@ -145,8 +149,7 @@ def read_evaluations(file: Path) -> list[Evaluation]:
             return_mean=row["return_mean"],
             episodes=int(row["episodes"]),
             own_l1=None if math.isnan(row["own_l1"]) else bool(row["own_l1"]),
-            switch_rate=row[SWITCH_RATE],
-            steps_mean=row["steps_mean"],
+            **{field: row[column] for field, column in MEASURED.items()},
             returns=tuple(singly.get(_condition_key(row), ())),
         )
         for row in rows

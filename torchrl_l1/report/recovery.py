@@ -16,7 +16,7 @@ from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.l1_options import UNTUNED
 from torchrl_l1.experiment.matrix import disturbance_words, disturbed
-from torchrl_l1.report.page import Page, grouped, interval_text, markdown, number, spread_text
+from torchrl_l1.report.page import Page, Row, grouped, interval_text, markdown, number, spread_text
 from torchrl_l1.report.statistics import recovered
 from torchrl_l1.report.study import noise_order
 from torchrl_l1.report.style import (
@@ -28,8 +28,6 @@ from torchrl_l1.report.style import (
     save,
     title,
 )
-
-Row = Mapping[str, Any]
 
 FEW_DISTURBANCES = 2
 """As many that vary have a column each in a table; of more, one column names the disturbance."""

@@ -26,7 +26,7 @@ from torchrl_l1.report.identity import BASELINE
 _DPI = 130
 
 # Okabe and Ito: told apart with any colour vision. Grey is kept for the authors' curves.
-_ARMS = {"off": "#D55E00", "paper": "#0072B2", "robust": "#009E73"}
+_ARMS = {BASELINE: "#D55E00", "paper": "#0072B2", "robust": "#009E73"}
 _ARMS |= {"reference": "#E69F00", "slow": "#CC79A7"}
 _ARMS[ORACLE] = "#000000"
 _CYCLE = ("#D55E00", "#0072B2", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#000000")

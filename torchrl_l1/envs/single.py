@@ -28,7 +28,7 @@ PAGE = "see the page on environments"
 _LARGEST_BOUND = 1e9
 
 
-class Cell(Protocol):
+class SingleEnv(Protocol):
     """One environment, every reset of which has a seed of its own.
 
     Attributes:
@@ -63,7 +63,7 @@ class Cell(Protocol):
         """Free what it holds."""
 
 
-class GymnasiumCell:
+class SingleGymnasiumEnv:
     """An environment of Gymnasium, without TorchRL between."""
 
     def __init__(self, env: gymnasium.Env[Any, Any], name: str, keys: Sequence[str]) -> None:
@@ -109,7 +109,7 @@ class GymnasiumCell:
         return found.reshape(-1)
 
     def reset(self, seed: int) -> np.ndarray:
-        """See :class:`Cell`."""
+        """See :class:`SingleEnv`."""
         return self._observed(self._parts("reset", self.env.reset(seed=seed), 2)[0])
 
     def _parts(self, method: str, returned: Any, count: int) -> tuple[Any, ...]:
@@ -122,7 +122,7 @@ class GymnasiumCell:
         return returned
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
-        """See :class:`Cell`."""
+        """See :class:`SingleEnv`."""
         stepped = self._parts("step", self.env.step(action.astype(self._type)), 5)
         observation, reward, terminated, truncated, _ = stepped
         # Some give an array with one number.
@@ -130,28 +130,28 @@ class GymnasiumCell:
         return self._observed(observation), earned, bool(terminated), bool(truncated)
 
     def time_step(self) -> float | None:
-        """See :class:`Cell`."""
+        """See :class:`SingleEnv`."""
         return time_step(GymWrapper(self.env))
 
     def horizon(self) -> int | None:
-        """See :class:`Cell`."""
+        """See :class:`SingleEnv`."""
         return _time_limit(self.env)
 
     def simulation(self) -> Any:
-        """See :class:`Cell`."""
+        """See :class:`SingleEnv`."""
         inner: Any = self.env.unwrapped
         return inner if isinstance(getattr(inner, "model", None), mujoco.MjModel) else None
 
     def outcome(self) -> Outcome | None:
-        """See :class:`Cell`."""
+        """See :class:`SingleEnv`."""
         return None if self._keys else known_outcome(self.env)
 
     def close(self) -> None:
-        """See :class:`Cell`."""
+        """See :class:`SingleEnv`."""
         self.env.close()
 
 
-class TorchRLCell:
+class SingleTorchRLEnv:
     """An environment of TorchRL."""
 
     def __init__(self, env: EnvBase, name: str, keys: Sequence[str]) -> None:
@@ -175,7 +175,7 @@ class TorchRLCell:
         self.observation_dim = int(self.env.observation_spec["observation"].shape[-1])
 
     def reset(self, seed: int) -> np.ndarray:
-        """See :class:`Cell`."""
+        """See :class:`SingleEnv`."""
         # Some draw from torch's global generator; what a policy draws must not start anew.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -184,7 +184,7 @@ class TorchRLCell:
         return self._observed(self._state)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
-        """See :class:`Cell`."""
+        """See :class:`SingleEnv`."""
         given = torch.from_numpy(action).reshape(self.env.action_spec.shape)
         data = self.env.step(self._state.set("action", given))
         self._state = step_mdp(data)
@@ -201,11 +201,11 @@ class TorchRLCell:
         return observation
 
     def time_step(self) -> float | None:
-        """See :class:`Cell`."""
+        """See :class:`SingleEnv`."""
         return time_step(self.env)
 
     def horizon(self) -> int | None:
-        """See :class:`Cell`."""
+        """See :class:`SingleEnv`."""
         env: EnvBase = self.env
         limits: list[Any] = []
         frames = 1
@@ -229,15 +229,15 @@ class TorchRLCell:
         return min((limit for limit in limits if _is_limit(limit)), default=None)
 
     def simulation(self) -> Any:
-        """See :class:`Cell`."""
+        """See :class:`SingleEnv`."""
         return simulation_of(self.env)
 
     def outcome(self) -> Outcome | None:
-        """See :class:`Cell`."""
+        """See :class:`SingleEnv`."""
         return None
 
     def close(self) -> None:
-        """See :class:`Cell`."""
+        """See :class:`SingleEnv`."""
         self.env.close(raise_if_closed=False)
 
 
