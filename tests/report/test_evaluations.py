@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from torchrl_l1.envs import DISTURBANCES
+from torchrl_l1.experiment.matrix import Axis, Condition, axes
 from torchrl_l1.report.evaluation_summary import summarize, summary_tables
 from torchrl_l1.report.evaluations import (
     ablation_rows,
@@ -36,6 +38,26 @@ def evaluated(value: float, *cells: tuple[str, str, str, float]) -> list[dict[st
         row | {"l1": l1, "noise": noise, "policy": policy, "return_mean": value + more}
         for l1, noise, policy, more in cells
     ]
+
+
+@pytest.mark.parametrize("axis", axes(), ids=lambda axis: axis.name)
+def test_tests_that_differ_in_whatever_an_evaluation_varies_are_not_pooled(
+    axis: Axis, write_run: WriteRun, tmp_path: Path
+) -> None:
+    value = 0.25 if axis.kind is float else {"stage": "cloning"}.get(axis.name, "robust")
+    value = "deterministic" if axis.name == "policy" else value
+    given = {"l1": "paper", axis.name: value}
+    varied = {n: given.pop(n) for n in set(given) & set(DISTURBANCES)}
+    tests = [Condition("paper"), Condition(**given, disturbances=varied)]
+    rows = [
+        {**test.columns(), "return_mean": value, "episodes": 5}
+        for test, value in zip(tests, (1.0, 2.0), strict=True)
+    ]
+    assert len(summarize(rows)) == 2
+    write_run([1.0], "l1=off", seed=0, evaluations={"mine": rows})
+    found = evaluation_rows(study(tmp_path), "mine")
+    assert sorted(row["return_mean"] for row in found) == [1.0, 2.0]
+    assert {row["training_seeds"] for row in found} == {1}
 
 
 def test_a_table_says_over_how_many_seeds_each_controller_was_tested(

@@ -20,7 +20,7 @@ from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.evaluate import episodes_file
 from torchrl_l1.experiment.files import read_text
-from torchrl_l1.experiment.matrix import Condition
+from torchrl_l1.experiment.matrix import Condition, axes
 
 SWITCH_RATE = "l1/switch_rate"
 """Column of the switches per step."""
@@ -71,6 +71,9 @@ def read_seconds(file: Path, iterations: int, phases: Sequence[str]) -> dict[str
 # Every table has the columns of these; that of another disturbance may be absent.
 _FIRST_DISTURBANCES = ("bias", "gain")
 
+# What a test may have set of a controller.
+_TUNED = ("epsilon", "alpha")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation(Condition):
@@ -96,13 +99,13 @@ class Evaluation(Condition):
     @property
     def condition(self) -> tuple[Any, ...]:
         """What was tested: equal for repetitions. See :func:`condition_columns`."""
-        place = (self.noise, *self.disturbances.values(), self.policy, self.stage or "")
-        return self.controller, *place
+        columns = {**self.columns(), "l1": self.controller, "stage": self.stage or ""}
+        return tuple(columns[name] for name in condition_columns())
 
     @property
     def tuned(self) -> bool:
         """Whether the test has set values of the controller."""
-        return self.epsilon is not None or self.alpha is not None
+        return any(getattr(self, name) is not None for name in _TUNED)
 
 
 MEASURED: Mapping[str, str] = {"steps_mean": "steps_mean", "switch_rate": SWITCH_RATE}
@@ -110,8 +113,13 @@ MEASURED: Mapping[str, str] = {"steps_mean": "steps_mean", "switch_rate": SWITCH
 
 
 def condition_columns() -> tuple[str, ...]:
-    """Names of the values of :attr:`Evaluation.condition`."""
-    return "l1", "noise", *DISTURBANCES, "policy", "stage"
+    """Names of the values of :attr:`Evaluation.condition`; the controller's own are in ``l1``.
+
+    Examples:
+        >>> [name for name in condition_columns() if name not in DISTURBANCES]
+        ['l1', 'noise', 'policy', 'stage']
+    """
+    return tuple(axis.name for axis in axes() if axis.name not in _TUNED)
 
 
 def read_evaluations(file: Path) -> list[Evaluation]:
@@ -139,13 +147,7 @@ def read_evaluations(file: Path) -> list[Evaluation]:
             )
     return [
         Evaluation(
-            l1=row["l1"],
-            noise=row["noise"],
-            disturbances={name: row[name] for name in DISTURBANCES if name in row},
-            policy=row["policy"],
-            epsilon=_known(row["epsilon"]),
-            alpha=_known(row["alpha"]),
-            stage=row["stage"] or None,
+            **_varied(row),
             return_mean=row["return_mean"],
             episodes=int(row["episodes"]),
             own_l1=None if math.isnan(row["own_l1"]) else bool(row["own_l1"]),
@@ -154,6 +156,17 @@ def read_evaluations(file: Path) -> list[Evaluation]:
         )
         for row in rows
     ]
+
+
+def _varied(row: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a condition."""
+    words = {axis.name: row[axis.name] or None for axis in axes() if axis.kind is str}
+    tuned = {name: _known(row[name]) for name in _TUNED}
+    return {
+        **words,
+        **tuned,
+        "disturbances": {name: row[name] for name in DISTURBANCES if name in row},
+    }
 
 
 def _is_mean(row: Mapping[str, Any], returns: Sequence[float]) -> bool:
@@ -186,16 +199,15 @@ def _condition_rows(
         file,
         (*_FIRST_DISTURBANCES, *numbers),
         ("l1", "noise", "policy"),
-        ("epsilon", "alpha", *optional),
+        (*_TUNED, *optional),
         ("stage",),
         later,
     )
 
 
 def _condition_key(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    disturbances = (row.get(name) for name in DISTURBANCES)
-    tuning = (_known(row["epsilon"]), _known(row["alpha"]))
-    return row["l1"], row["noise"], *disturbances, row["policy"], *tuning, row["stage"]
+    tuning = {name: _known(row[name]) for name in _TUNED}
+    return tuple({**row, **tuning}.get(axis.name) for axis in axes())
 
 
 def one_policy(tests: Sequence[Evaluation]) -> list[Evaluation]:
