@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -58,6 +60,45 @@ def test_what_is_not_made_of_torchs_operations_is_refused(robust, tmp_path):
     with pytest.raises(ValueError, match="without-policy"):
         export(numpy, tmp_path / "policy.pt", steps=10)
     assert export(numpy, tmp_path / "l1.pt", with_policy=False, steps=10).error < 1e-5
+
+
+def decides(x):
+    """One action along an undisturbed episode, and another where that does not lead."""
+    return -torch.ones_like(x[..., :1]) if (x[..., 1] > 0.5).any() else x[..., 1:2]
+
+
+def decides_in_numpy(x):
+    x = np.asarray(x)
+    return np.where(x[..., 1:2] > 0.5, -1.0, 1.0).astype(np.float32)
+
+
+@pytest.mark.parametrize("policy", [decides, decides_in_numpy])
+@pytest.mark.parametrize("suffix", [".pt", ".pt2"])
+def test_policies_that_decide_in_python_are_refused(robust, tmp_path, policy, suffix, capfd):
+    with pytest.raises(ValueError, match="without-policy") as error:
+        export(with_policy(robust, policy), tmp_path / f"policy{suffix}", steps=3)
+    assert "\n" not in str(error.value) and not list(tmp_path.iterdir())
+    assert "forward" not in "".join(capfd.readouterr()), "programs of torch's"
+
+
+def test_decisions_in_torch_are_written(robust, tmp_path):
+    bang = with_policy(robust, lambda x: torch.where(x[..., 1:2] > 0.5, -1.0, 1.0))
+    found = export(bang, tmp_path / "policy.pt", steps=3)
+    step = torch.jit.load(str(found.file))
+    state = robust.wrap(robust.source.one()).reset()["l1"]
+    entries = [state[name].reshape(1, -1) for name in found.inputs[1:]]
+    for angle, expected in ((0.0, 1.0), (1.0, -1.0)):
+        action, *_ = step(torch.tensor([[0.0, angle, 0.0, 0.0]]), *entries)
+        assert action.item() == pytest.approx(expected, abs=1e-5)
+
+
+def test_the_place_is_looked_at_before_work(robust, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.pt").mkdir()
+    monkeypatch.setattr(sys.modules["torchrl_l1.deployment.export"], "run_episodes", None)
+    for place in ("file/policy.pt", "folder.pt"):
+        with pytest.raises(OSError, match=place.partition(".")[0].split("/")[0]):
+            export(robust, tmp_path / place, steps=3)
 
 
 def test_other_suffixes_are_refused(robust, tmp_path):

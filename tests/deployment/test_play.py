@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -51,6 +53,18 @@ def test_what_cannot_be_shown_is_refused_at_once(monkeypatch, tmp_path):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(ValueError, match="no display"):
         play.check_film(None)
+
+
+def test_the_place_of_a_film_is_looked_at_before_work(tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").touch()
+    (tmp_path / "film.gif").mkdir()
+    command = import_module("torchrl_l1.cli.play")
+    monkeypatch.setattr(command, "load_target", lambda *_, **__: SimpleNamespace(preset="robust"))
+    monkeypatch.setattr(command, "film", None)
+    for place in ("file/film.gif", "film.gif"):
+        with pytest.raises(SystemExit):
+            main(["play", "runs/a", "--output", str(tmp_path / place)])
+        assert "move it away" in capsys.readouterr().err
 
 
 def test_a_film_of_an_episode(robust):

@@ -7,6 +7,7 @@ import os
 import pickle
 import shlex
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -368,6 +369,19 @@ def test_what_a_command_refuses(
         with pytest.raises(SystemExit):
             main(["dataset", *arguments])
         assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("output", ["file/a.npz", "file/folder"])
+def test_the_place_of_a_dataset_is_looked_at_before_work(
+    output: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("file").touch()
+    command = import_module("torchrl_l1.cli.dataset")
+    monkeypatch.setattr(command, "load_run", lambda _: None)
+    monkeypatch.setattr(command, "record", None)
+    with pytest.raises(SystemExit):
+        main(["dataset", "runs/a", output])
+    assert "something is in the way" in capsys.readouterr().err
 
 
 def test_kill_and_resume_leave_equal_metrics(tmp_path: Path) -> None:

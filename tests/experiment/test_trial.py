@@ -72,9 +72,10 @@ def test_a_new_recipe_composes_and_needs_no_fix(
     assert (config.task, config.reward, config.recipe) == (
         "gymnasium/Pendulum-v1", "builtin", "swing",
     )  # fmt: skip
-    main(["check", "swing.yaml", "--steps", "1000"])
+    main(["check", "swing.yaml", "seed=1", "--steps", "1000", "horizon=100"])
     said = capsys.readouterr().out
     assert "fix" not in said.replace("nothing to fix", "")
+    assert said.endswith("torchrl-l1 run swing.yaml seed=1 horizon=100\n")
     assert "the reward function gives the environment's rewards" in said
     with pytest.raises(SystemExit):
         main(["new-task", "swing.yaml", "--from", "gymnasium/Pendulum-v1"])
@@ -122,6 +123,7 @@ def test_what_will_not_do_is_a_line(place: Path, capsys: pytest.CaptureFixture[s
         (["new-task", "a.txt", "--from", "gymnasium/Pendulum-v1"], "must end in .yaml"),
         (["new-task", "a.yaml", "--from", "odd.py:make_env"], "give horizon=STEPS"),
         (["check", "pets/any", "task=gymnasium/CartPole-v1"], "Discrete(2) as actions"),
+        (["check", "pets/any", "--steps", "9", "task=gymnasium/Pendulum-v1"], "at least 10, got 9"),
     ):
         with pytest.raises(SystemExit):
             main(arguments)

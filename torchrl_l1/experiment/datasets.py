@@ -60,7 +60,7 @@ def read_dataset(source: str, columns: DatasetColumns | None = None) -> TensorDi
             return _TABLES[path.suffix](path, columns)
         elif path.is_file():
             data = _file(path, columns)
-        elif _MINARI_NAME.fullmatch(source):
+        elif is_minari_name(source):
             data = read_minari(source)
         else:
             raise FileNotFoundError(
@@ -69,6 +69,11 @@ def read_dataset(source: str, columns: DatasetColumns | None = None) -> TensorDi
     except (ModuleNotFoundError, TypeError) as error:
         raise ValueError(str(error)) from error
     return _named(source, data, columns)
+
+
+def is_minari_name(text: str) -> bool:
+    """Whether a text is the name of a dataset of Minari's, such as ``hopper/medium-v0``."""
+    return _MINARI_NAME.fullmatch(text) is not None
 
 
 def _file(path: Path, columns: DatasetColumns) -> TensorDictBase:
@@ -319,7 +324,7 @@ def write_dataset(output: str, episodes: Sequence[Episode], task: AnyTask, algor
         path.parent.mkdir(parents=True, exist_ok=True)
         rows: dict[str, Any] = _rows(episodes)
         write_through(path, lambda buffer: np.savez_compressed(buffer, **rows))
-    elif _MINARI_NAME.fullmatch(output):
+    elif is_minari_name(output):
         _write_minari(output, episodes, task, algorithm)
     else:
         _write_folder(path, _transitions(episodes))
@@ -363,9 +368,9 @@ def check_output(output: str) -> None:
         raise ValueError(f"{output} is there already: choose another place, or remove it")
     if path.suffix == ".npz":
         return
-    if path.suffix and not _MINARI_NAME.fullmatch(output):
+    if path.suffix and not is_minari_name(output):
         raise ValueError(f"{output}: datasets are .npz files, folders, or Minari's (name-v0)")
-    if _MINARI_NAME.fullmatch(output):
+    if is_minari_name(output):
         try:
             import minari
 
