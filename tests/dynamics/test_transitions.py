@@ -361,6 +361,41 @@ def test_changes_lost_in_the_digits_of_large_values_are_told(offset: float) -> N
     assert [message[:22] for message in digits] == ["'seen'[1] changes by 0"] * (offset == 5e6)
 
 
+@pytest.mark.parametrize(
+    ("of_x", "of_u", "told"),
+    [
+        (1.0, 1.0, []),
+        (1e-7, 1.0, ["'observation'[0] changes", "'observation'[1] changes"]),
+        (1.0, 1e-6, ["'action'[0] varies"]),
+    ],
+)
+def test_units_that_are_too_large_for_the_model_are_told(
+    of_x: float, of_u: float, told: list[str]
+) -> None:
+    """A micrometre in metres is no constant, and no want of data."""
+    torch.manual_seed(0)
+    x, u = torch.randn(500, 2), torch.randn(500, 1)
+    change = 0.3 * torch.cat([x[:, 1:], u], -1)
+    data = TensorDict({"observation": of_x * x, "action": of_u * u}, [500])
+    data["next", "observation"] = of_x * (x + change)
+
+    def fitted(**settings: float) -> tuple[list[str], float]:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            model = fit_dynamics(data, hidden=(32,), batch_size=64, max_epochs=100, **settings)
+        assert model.quality is not None
+        return [str(one.message) for one in caught], min(model.quality.explained)
+
+    messages, explained = fitted()
+    small = [message for message in messages if "std_floor" in message]
+    assert [message.partition(" by")[0] for message in small] == told
+    if told:
+        assert explained < 0.8
+        floor = min(float(message.rpartition(" ")[2]) for message in small)
+        messages, explained = fitted(std_floor=floor)
+    assert not messages and explained > 0.95
+
+
 def test_inputs_that_never_vary_are_ignored_and_told() -> None:
     torch.manual_seed(0)
     x, u = torch.randn(500, 3), torch.randn(500, 2)

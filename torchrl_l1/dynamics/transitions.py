@@ -43,18 +43,23 @@ class Transitions:
     dropped: int
 
     def warn_of_gaps(
-        self, observation_key: NestedKey = "observation", action_key: NestedKey = "action"
+        self,
+        observation_key: NestedKey = "observation",
+        action_key: NestedKey = "action",
+        std_floor: float = 1e-4,
     ) -> None:
         """Warn of what no model can be told by the data.
 
         Args:
             observation_key: what the observation is called where it comes from.
             action_key: what the action is called there.
+            std_floor: the model's smallest standard deviation.
 
         Warns:
-            UserWarning: naming entries of the action that never vary, and entries of the
-                observation whose changes vary by less than 20 steps of their type. What varies by
-                less than 0.0001 counts as constant, as it does for the model.
+            UserWarning: naming entries of the action that never vary, entries whose values or
+                changes vary by less than a tenth of ``std_floor``, as in units that are too large,
+                and entries of the observation whose changes vary by less than 20 steps of their
+                type. What varies by less than ``std_floor`` is not among the last.
         """
         action = self.data["action"]
         for entry in (action == action[:1]).all(0).nonzero().squeeze(-1).tolist():
@@ -66,8 +71,9 @@ class Transitions:
             )
         before, after = self.data["observation"], self.data["next", "observation"]
         spread = (after - before).std(0, correction=0)
+        self._warn_of_units(_name(observation_key), _name(action_key), spread, std_floor)
         step = before.abs().amax(0) * torch.finfo(before.dtype).eps
-        for entry in ((spread > 1e-4) & (spread < 20 * step)).nonzero().squeeze(-1).tolist():
+        for entry in ((spread > std_floor) & (spread < 20 * step)).nonzero().squeeze(-1).tolist():
             kind = str(before.dtype).removeprefix("torch.")
             warnings.warn(
                 f"{_name(observation_key)}[{entry}] changes by {spread[entry]:.2g} per step, and "
@@ -75,6 +81,28 @@ class Transitions:
                 "an offset first",
                 stacklevel=3,
             )
+
+    def _warn_of_units(self, observation: str, action: str, change: Tensor, floor: float) -> None:
+        x, u = self.data["observation"].double(), self.data["action"].double()
+        told = set()
+        for name, what, values, size in (
+            (observation, "changes by {} per step", change, x.abs().amax(0)),
+            (observation, "varies by {}", x.std(0, correction=0), x.abs().amax(0)),
+            (action, "varies by {}", u.std(0, correction=0), u.abs().amax(0)),
+        ):
+            # What is less is the noise of numbers, or of a simulation.
+            noise = (20 * torch.finfo(change.dtype).eps * size).clamp_min(1e-9)
+            small = (values > noise) & (values < 0.1 * floor)
+            for entry in small.nonzero().squeeze(-1).tolist():
+                if (name, entry) in told:
+                    continue
+                told.add((name, entry))
+                warnings.warn(
+                    f"{name}[{entry}] {what.format(f'{values[entry]:.2g}')}, next to nothing for a "
+                    f"model with std_floor={floor:g}: give it in smaller units, or a std_floor of "
+                    f"{values[entry] / 10:.0e}",
+                    stacklevel=4,
+                )
 
 
 def read_transitions(
