@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tensordict import TensorDict, lazy_stack
+from tensordict import NonTensorStack, TensorDict, lazy_stack
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.collectors.utils import split_trajectories
@@ -44,6 +44,17 @@ def line(*lengths: int, offset: float = 0.0) -> TensorDict:
             )
         )
     return torch.cat(parts)
+
+
+def wide(length: int) -> TensorDict:
+    data = line(length)
+    for key in ("observation", ("next", "observation")):
+        data[key] = data[key].expand(length, 2)
+    return data
+
+
+def labelled(data: TensorDict, ids: object) -> TensorDict:
+    return data.set("traj_ids", ids)
 
 
 def buffer(data: TensorDict, ndim: int = 1) -> ReplayBuffer:
@@ -297,13 +308,29 @@ def test_errors_name_the_key_and_what_is_there(
     ("data", "error", "message"),
     [
         (line(3)[0], ValueError, r"batch size \[\]"),
-        ({"observation": 1}, TypeError, "tensordict, several of them or a ReplayBuffer .* str"),
+        ({"observation": 1}, TypeError, "tensordict, several of them or a ReplayBuffer .* dict: "),
+        ("log.csv", TypeError, "got str: .* read_csv and read_npz of tables"),
+        ([line(3), wide(3)], ValueError, "observations of widths 1, 2 in their parts"),
+        (labelled(line(4), torch.zeros(4, 2)), ValueError, "'traj_ids' holds 8 numbers for 4 tran"),
         ([torch.zeros(3)], TypeError, "got Tensor"),
     ],
 )
 def test_other_data_are_refused(data: object, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         read_transitions(data)
+
+
+@pytest.mark.parametrize(
+    "ids",
+    [
+        torch.tensor([0.2, 0.2, 0.7, 0.7]),
+        torch.tensor([[-3], [-3], [2**40], [2**40]]),
+        NonTensorStack("a", "a", "b", "b"),
+    ],
+)
+def test_trajectories_may_have_any_names(ids: object) -> None:
+    read = read_transitions(labelled(line(4).exclude(("next", "done")), ids))
+    assert read.joined.tolist() == [True, False, True, False]
 
 
 def test_rows_with_a_flag_are_taken_as_they_are() -> None:

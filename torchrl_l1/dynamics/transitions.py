@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
@@ -145,7 +146,7 @@ def read_transitions(
     Raises:
         KeyError: if the data lack one of the keys.
         TypeError: for other data.
-        ValueError: if shapes do not fit.
+        ValueError: if shapes do not fit, or widths of the parts differ.
     """
     read: list[TensorDict] = []
     trajectories = 0
@@ -156,6 +157,13 @@ def read_transitions(
         read.append(one)
     if not read:
         return _nothing()
+    for key in ("observation", "action"):
+        widths = sorted({one[key].shape[-1] for one in read})
+        if len(widths) > 1:
+            raise ValueError(
+                f"the data have {key}s of widths {', '.join(map(str, widths))} in their parts: "
+                "leave out those of another system"
+            )
     rows: TensorDictBase = TensorDict.cat(read)
     keep = rows["real"] & _is_transition(rows, (observation_key, action_key))
     kept = keep.nonzero().squeeze(-1)
@@ -167,6 +175,27 @@ def read_transitions(
     if not held_out.any():
         held_out = _hold_out(rows["trajectory"], validation_fraction, seed)
     return Transitions(rows.select("observation", "action", "next"), held_out, joined, dropped)
+
+
+def check_time_step(data: Data, dt: float, whose: str) -> None:
+    """Refuse data of steps of another length, where they hold one (``dt``, s).
+
+    Args:
+        data: as :func:`read_transitions` takes them.
+        dt: time of a step in seconds; that of the data may differ by 2 %, as clocks do.
+        whose: what takes such steps.
+
+    Raises:
+        ValueError: naming both.
+    """
+    for part in _parts(data):
+        step = part.get("dt", None)
+        taken = dt if step is None or not step.numel() else float(step.double().median())
+        if not abs(taken - dt) <= 0.02 * dt:
+            raise ValueError(
+                f"the data were recorded with steps of {taken:.4g} s, and {whose} takes {dt:.4g} "
+                "s: resample them, or let its steps be as long"
+            )
 
 
 def split_validation(
@@ -212,7 +241,9 @@ def _parts(data: Data) -> list[TensorDictBase]:
         if not isinstance(part, TensorDictBase):
             raise TypeError(
                 "data must be a tensordict, several of them or a ReplayBuffer of tensordicts, got "
-                f"{type(part).__name__}"
+                f"{type(part if isinstance(data, list | tuple) else data).__name__}: "
+                "TensorDict(..., batch_size=[N]) makes one of tensors, read_csv and read_npz of "
+                "tables"
             )
         if not part.ndim:
             raise ValueError("data have batch size []: give transitions with a batch size [N]")
@@ -357,8 +388,19 @@ def _name(key: NestedKey) -> str:
 
 def _trajectory_ids(data: TensorDictBase, device: torch.device) -> Tensor | None:
     for key in _TRAJECTORY_IDS:
-        if (value := data.get(key, None)) is not None:
-            return value.reshape(-1).long().to(device)
+        if (value := data.get(key, None)) is None:
+            continue
+        if isinstance(value, Tensor):
+            ids = value.reshape(-1).to(device).unique(return_inverse=True)[1]
+        else:  # names
+            names = np.array(value.tolist() if data.ndim else [], dtype=str).reshape(-1)
+            ids = torch.from_numpy(np.unique(names, return_inverse=True)[1]).to(device)
+        if len(ids) != data.numel():
+            raise ValueError(
+                f"{_name(key)} holds {len(ids)} numbers for {data.numel()} transitions: expected "
+                "one for each"
+            )
+        return ids
     return None
 
 
