@@ -67,7 +67,9 @@ class ControlledStep(nn.Module):
         # Neither is registered, and their weights become constants: tracers walk through the
         # attributes of what is, and those of TorchRL's actors raise.
         self.jacobian = ActionJacobian(copy.deepcopy(model).requires_grad_(False))
-        self.policies = () if policy is None else (copy.deepcopy(policy).requires_grad_(False),)
+        self.policies: tuple[TensorDictModuleBase, ...] = ()
+        if policy is not None:
+            self.policies = (copy.deepcopy(policy).requires_grad_(False),)
         fresh = init([1], model.observation_dim, model.action_dim, config)
         self.fresh = fresh.entries()
 
