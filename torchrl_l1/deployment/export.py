@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager, redirect_stderr
@@ -13,7 +14,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import tensordict
 import torch
+import torchrl
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
@@ -69,7 +72,14 @@ class ControlledStep(nn.Module):
         self.jacobian = ActionJacobian(copy.deepcopy(model).requires_grad_(False))
         self.policies: tuple[TensorDictModuleBase, ...] = ()
         if policy is not None:
-            self.policies = (copy.deepcopy(policy).requires_grad_(False),)
+            copied = copy.deepcopy(policy)
+            for parameter in copied.parameters():
+                parameter.detach_()  # of a copied script parameters are no leaves
+                parameter.requires_grad_(False)
+            self.policies = (copied,)
+            # A trace takes scripts as they are, from what is registered.
+            parts = [part for part in copied.modules() if isinstance(part, torch.jit.ScriptModule)]
+            self.scripts = nn.ModuleList(parts)
         fresh = init([1], model.observation_dim, model.action_dim, config)
         self.fresh = fresh.entries()
 
@@ -288,6 +298,15 @@ class _Policy(nn.Module):
         return step._act(step.policies[0], observation)
 
 
+def _checks_arguments(error: GuardOnDataDependentSymNode) -> bool:
+    """Whether a decision is one of TorchRL's own, as distributions look at what they are given."""
+    files = [Path(frame.filename) for frame in traceback.extract_tb(error.__traceback__)]
+    torchs = Path(torch.__file__).parent
+    own = [file for file in files if not file.is_relative_to(torchs)]
+    libraries = (Path(torchrl.__file__).parent, Path(tensordict.__file__).parent)
+    return any(own[-1].is_relative_to(folder) for folder in libraries)
+
+
 def _refuse_decisions(module: ControlledStep, observation: Tensor) -> None:
     """Refuse a policy that decides by values: a trace holds the side that was taken, and no word.
 
@@ -296,8 +315,9 @@ def _refuse_decisions(module: ControlledStep, observation: Tensor) -> None:
     """
     try:
         torch.export.export(_Policy(module), (observation,))
-    except GuardOnDataDependentSymNode:
-        raise
+    except GuardOnDataDependentSymNode as error:
+        if not _checks_arguments(error):
+            raise
     except Exception:  # what a program cannot hold for another reason a trace may
         return
 
