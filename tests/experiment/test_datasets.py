@@ -192,6 +192,10 @@ def test_a_table_needs_names() -> None:
         read_dataset("drive.csv")
     columns = DatasetColumns(["a", "b"], ["u"], time="t")
     assert read_dataset("drive.csv", columns)["next", "observation"].tolist() == [[1, 0], [2, 1]]
+    for mark in (";", "\t"):  # as spreadsheets write it where decimals have commas
+        text = Path("drive.csv").read_text().replace(",", mark)
+        Path("other.csv").write_text("\n" + text)
+        assert (read_dataset("other.csv", columns) == read_dataset("drive.csv", columns)).all()
     arrays = {"x": np.arange(6.0), "u": np.zeros(6), "run": np.array([0, 0, 0, 1, 1, 1])}
     np.savez("drive.npz", **arrays)
     data = read_dataset("drive.npz", DatasetColumns(["x"], ["u"], episode="run"))

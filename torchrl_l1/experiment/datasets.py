@@ -89,7 +89,11 @@ def _csv(path: Path, columns: DatasetColumns) -> TensorDict:
         raise ValueError(
             f"{path}: say which columns are what, columns.observation=[x,v] columns.action=[u]"
         )
-    return read_csv(path, **vars(columns))
+    # A recipe has no setting for it. What is no text, read_csv says.
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        header = next((line for line in file if line.strip()), "")
+    delimiter = next((mark for mark in (",", ";", "\t") if mark in header), ",")
+    return read_csv(path, **vars(columns), delimiter=delimiter)
 
 
 def _npz(path: Path, columns: DatasetColumns) -> TensorDict:
