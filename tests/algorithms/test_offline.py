@@ -54,6 +54,15 @@ def make(l1: L1Config | None = None, data: Any = None, **changes: Any) -> Offlin
     return Offline("inverted_pendulum", tiny(**changes), l1, data=data, horizon=25)
 
 
+def test_data_of_other_steps_are_refused() -> None:
+    """A log that was sampled five times as fast tells of another plant."""
+    data = recorded()
+    for dt in (0.04, 0.0402):
+        make(data=data.set("dt", torch.full((*data.shape, 1), dt))).prepare()
+    with pytest.raises(ValueError, match=r"steps of 0\.008 s, and the task .* takes 0\.04 s"):
+        make(data=data.set("dt", torch.full((*data.shape, 1), 0.008))).prepare()
+
+
 @pytest.mark.parametrize("penalty", ["mopo", "morel", "none"])
 def test_every_metric_is_documented_and_finite(penalty: str) -> None:
     results = [result.metrics for result in make(L1, penalty=penalty).iterate()]

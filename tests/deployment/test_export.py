@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 import torch
-from torchrl.modules import IndependentNormal, ProbabilisticActor
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torchrl.modules import IndependentNormal, ProbabilisticActor, TruncatedNormal
 
 from torchrl_l1.deployment import RobustController, export
 from torchrl_l1.deployment.export import cholesky, cholesky_solve, solve_triangular
@@ -60,6 +63,71 @@ def test_what_is_not_made_of_torchs_operations_is_refused(robust, tmp_path):
     assert export(numpy, tmp_path / "l1.pt", with_policy=False, steps=10).error < 1e-5
 
 
+def decides(x):
+    """One action along an undisturbed episode, and another where that does not lead."""
+    return -torch.ones_like(x[..., :1]) if (x[..., 1] > 0.5).any() else x[..., 1:2]
+
+
+def decides_in_numpy(x):
+    x = np.asarray(x)
+    return np.where(x[..., 1:2] > 0.5, -1.0, 1.0).astype(np.float32)
+
+
+class Decides(torch.nn.Module):
+    """The same as a module, for a script."""
+
+    def __init__(self):
+        super().__init__()
+        self.gain = torch.nn.Parameter(torch.ones(1))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        if bool((x[..., 1] > 0.5).any()):
+            return -torch.ones_like(x[..., :1])
+        return self.gain * x[..., 1:2]
+
+
+@pytest.mark.parametrize("policy", [decides, decides_in_numpy])
+@pytest.mark.parametrize("suffix", [".pt", ".pt2"])
+def test_policies_that_decide_in_python_are_refused(robust, tmp_path, policy, suffix, capfd):
+    with pytest.raises(ValueError, match="without-policy") as error:
+        export(with_policy(robust, policy), tmp_path / f"policy{suffix}", steps=3)
+    assert "\n" not in str(error.value) and not list(tmp_path.iterdir())
+    assert "forward" not in "".join(capfd.readouterr()), "programs of torch's"
+
+
+def test_decisions_in_torch_are_written(robust, tmp_path):
+    bang = with_policy(robust, lambda x: torch.where(x[..., 1:2] > 0.5, -1.0, 1.0))
+    found = export(bang, tmp_path / "policy.pt", steps=3)
+    step = torch.jit.load(str(found.file))
+    state = robust.wrap(robust.source.one()).reset()["l1"]
+    entries = [state[name].reshape(1, -1) for name in found.inputs[1:]]
+    for angle, expected in ((0.0, 1.0), (1.0, -1.0)):
+        action, *_ = step(torch.tensor([[0.0, angle, 0.0, 0.0]]), *entries)
+        assert action.item() == pytest.approx(expected, abs=1e-5)
+
+
+def test_scripts_and_checks_of_distributions_are_written(robust, tmp_path):
+    """What decides in a script is in it whole; TorchRL's checks of arguments are no decision."""
+    torch.jit.save(torch.jit.script(Decides()), str(tmp_path / "script.pt"))
+    network = torch.nn.Sequential(torch.nn.Linear(4, 2), NormalParamExtractor())
+    actor = ProbabilisticActor(
+        TensorDictModule(network, ["observation"], ["loc", "scale"]), ["loc", "scale"], ["action"],
+        distribution_class=TruncatedNormal, distribution_kwargs={"low": -3.0, "high": 3.0},
+    )  # fmt: skip
+    for policy in (f"torchscript:{tmp_path / 'script.pt'}", actor):
+        found = export(with_policy(robust, policy), tmp_path / "policy.pt", steps=3)
+        assert found.error < 1e-5
+
+
+def test_the_place_is_looked_at_before_work(robust, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.pt").mkdir()
+    monkeypatch.setattr(sys.modules["torchrl_l1.deployment.export"], "run_episodes", None)
+    for place in ("file/policy.pt", "folder.pt"):
+        with pytest.raises(OSError, match=place.partition(".")[0].split("/")[0]):
+            export(robust, tmp_path / place, steps=3)
+
+
 def test_other_suffixes_are_refused(robust, tmp_path):
     with pytest.raises(ValueError, match="format"):
         export(robust, tmp_path / "policy.json")
@@ -67,8 +135,6 @@ def test_other_suffixes_are_refused(robust, tmp_path):
 
 def test_sampling_policies_export_their_mean(robust, tmp_path):
     network = torch.nn.Sequential(torch.nn.Linear(4, 2), torch.nn.Tanh())
-    from tensordict.nn import NormalParamExtractor, TensorDictModule
-
     module = TensorDictModule(
         torch.nn.Sequential(network, NormalParamExtractor()), ["observation"], ["loc", "scale"]
     )

@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import GymWrapper
 
@@ -76,6 +78,27 @@ def test_files_of_policies_go_into_the_folder(robust, tmp_path):
     moved = tmp_path / "elsewhere"
     loaded.save(moved)
     assert RobustController.load(moved).policy.rows is False
+
+
+def test_what_is_named_is_found_from_any_folder(robust, policy_file, tmp_path, monkeypatch):
+    """Another file of that name, where the controller is used, is another policy."""
+    monkeypatch.chdir(tmp_path)
+    source = environment_source("own_policy.py:make_env")
+    own = replace(robust, source=source, origin={"policy": "own_policy.py:balance"})
+    own.save("controller")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    text = policy_file.read_text()
+    Path("own_policy.py").write_text(text.replace("1.0, 10.0", "-9.0, 0.0"))
+    loaded = RobustController.load("../controller")
+    data = TensorDict(observation=torch.randn(5, 4), batch_size=[5])
+    expected = balance(data["observation"]).clamp(-3.0, 3.0)
+    torch.testing.assert_close(loaded.policy(data)["action"], expected)
+    assert loaded.source.name == "own_policy.py:make_env"
+    # And from there once more.
+    loaded.save("again")
+    Path("own_policy.py").unlink()
+    assert RobustController.load("again").preset == "robust"
 
 
 def test_objects_are_asked_for_again(robust, tmp_path):

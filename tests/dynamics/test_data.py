@@ -125,8 +125,15 @@ def test_columns_padded_with_spaces(tmp_path: Path, delimiter: str, lines: list[
             ["angle,rate,torque", "0,0,0", "0,off,0"],
             {},
             ValueError,
-            "line 3, column 'rate': 'off' is no number",
+            "line 3, column 'rate': 'off' is no number; where there is no value, the cell is empty",
         ),
+        (
+            ["angle;rate;torque", "0;0,5;0"],
+            {"delimiter": ";"},
+            ValueError,
+            "line 2, column 'rate': '0,5' is no number; decimals stand behind a point",
+        ),
+        (["angle,rate,torque", "0,1_000,0"], {}, ValueError, "'1_000' is no number"),
         (
             # As R writes it, with the names of the rows; and with decimal commas.
             ["angle,rate,torque", "1,0,0,0", "2,0,0,0"],
@@ -148,7 +155,19 @@ def test_columns_padded_with_spaces(tmp_path: Path, delimiter: str, lines: list[
             ["angle,rate,torque,t", "0,0,0,5", "0,0,0,5"],
             {"time": "t"},
             ValueError,
-            "time never goes on",
+            "time never goes on from one row to the next: sort the rows",
+        ),
+        (
+            ["angle,rate,torque,t", *(f"0,0,0,{t}" for t in (3, 0, 4, 1, 6, 2, 9, 5))],
+            {"time": "t"},
+            ValueError,
+            "the time goes back 4 times, sort the rows by it",
+        ),
+        (
+            ["angle,rate,torque,run", *(f"0,0,0,{run}" for run in ("a", "a", "", "b", "", "nan"))],
+            {"episode": "run"},
+            ValueError,
+            "3 of 6 rows name no episode, row 3 first",
         ),
     ],
 )
@@ -179,15 +198,51 @@ def test_ends_of_episodes_are_not_passed_over(tmp_path: Path, name: str) -> None
     columns = {"angle": [0.0, 1, 2, 9, 8, 7], "rate": np.ones(6), "torque": np.ones(6)}
     rows = [",".join(map(str, row)) for row in zip(*columns.values(), ends, strict=True)]
     table = write(tmp_path / "log.csv", f"angle,rate,torque,{name}", *rows)
-    np.savez(tmp_path / "log.npz", **columns, **{name: ends.astype(bool)}, number=ends.cumsum())
+    np.savez(
+        tmp_path / "log.npz", **columns, **{name: ends.astype(bool)}, number=ends.cumsum() - ends
+    )
     message = rf"tells by '{name}' of 1 episodes that end before the last row"
     for read, file in ((read_csv, table), (read_npz, tmp_path / "log.npz")):
         with pytest.raises(ValueError, match=message):
             read(file, **KEYS)
-    assert len(read_npz(tmp_path / "log.npz", **KEYS, episode="number")) == 3
+    assert len(read_npz(tmp_path / "log.npz", **KEYS, episode="number")) == 4
     # One that only says that the log ends is no hindrance.
     rows[2] = rows[2][:-1] + "False"
     assert len(read_csv(write(table, f"angle,rate,torque,{name}", *rows), **KEYS)) == 5
+
+
+@pytest.mark.parametrize("options", [{"time": "t"}, {"episode": "day"}, {"episode": "late"}])
+def test_ends_within_an_episode_are_not_passed_over(
+    tmp_path: Path, options: dict[str, str]
+) -> None:
+    """Time that goes on over resets, a number of something else, a count that is one row late."""
+    ends = np.array([0, 0, 1, 0, 0, 1])
+    columns = {"angle": [0.0, 1, 2, 9, 8, 7], "rate": np.ones(6), "torque": np.ones(6)}
+    columns |= {"t": np.arange(6), "day": np.zeros(6), "late": ends.cumsum(), "done": ends}
+    rows = [",".join(map(str, row)) for row in zip(*columns.values(), strict=True)]
+    table = write(tmp_path / "log.csv", ",".join(columns), *rows)
+    np.savez(tmp_path / "log.npz", **columns)
+    for read, file in ((read_csv, table), (read_npz, tmp_path / "log.npz")):
+        with pytest.raises(ValueError, match="tells by 'done' of 1 ends within"):
+            read(file, **KEYS, **options)
+
+
+def test_an_end_may_have_its_last_observation_behind_it(tmp_path: Path) -> None:
+    lines = [f"{x},0,1,{run},{end}" for run in "ab" for x, end in ((0, 0), (1, 1), (2, 0))]
+    file = write(tmp_path / "log.csv", "angle,rate,torque,run,terminated", *lines)
+    data = read_csv(file, **KEYS, episode="run")
+    assert data["next", "observation"][:, 0].tolist() == [1, 2, 1, 2]
+
+
+def test_names_of_episodes_that_come_back_begin_new_ones(tmp_path: Path) -> None:
+    """Two files in one, of which each counts its episodes from nought."""
+    lines = [f"{x},0,1,{run},{x}" for run in (0, 1, 0, 1) for x in range(5)]
+    file = write(tmp_path / "log.csv", "angle,rate,torque,run,t", *lines)
+    with pytest.warns(UserWarning, match="names of episodes come back 2 times"):
+        data = read_csv(file, **KEYS, episode="run")
+    assert ((data["next", "observation"] - data["observation"])[:, 0] == 1).all()
+    assert len(data) == 16 and data["next", "done"].sum() == 4
+    assert len(read_csv(file, **KEYS, episode="run", time="t")) == 16  # which needs no warning
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tensordict import TensorDict, lazy_stack
+from tensordict import NonTensorStack, TensorDict, lazy_stack
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.collectors.utils import split_trajectories
@@ -44,6 +44,17 @@ def line(*lengths: int, offset: float = 0.0) -> TensorDict:
             )
         )
     return torch.cat(parts)
+
+
+def wide(length: int) -> TensorDict:
+    data = line(length)
+    for key in ("observation", ("next", "observation")):
+        data[key] = data[key].expand(length, 2)
+    return data
+
+
+def labelled(data: TensorDict, ids: object) -> TensorDict:
+    return data.set("traj_ids", ids)
 
 
 def buffer(data: TensorDict, ndim: int = 1) -> ReplayBuffer:
@@ -297,13 +308,29 @@ def test_errors_name_the_key_and_what_is_there(
     ("data", "error", "message"),
     [
         (line(3)[0], ValueError, r"batch size \[\]"),
-        ({"observation": 1}, TypeError, "tensordict, several of them or a ReplayBuffer .* str"),
+        ({"observation": 1}, TypeError, "tensordict, several of them or a ReplayBuffer .* dict: "),
+        ("log.csv", TypeError, "got str: .* read_csv and read_npz of tables"),
+        ([line(3), wide(3)], ValueError, "observations of widths 1, 2 in their parts"),
+        (labelled(line(4), torch.zeros(4, 2)), ValueError, "'traj_ids' holds 8 numbers for 4 tran"),
         ([torch.zeros(3)], TypeError, "got Tensor"),
     ],
 )
 def test_other_data_are_refused(data: object, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         read_transitions(data)
+
+
+@pytest.mark.parametrize(
+    "ids",
+    [
+        torch.tensor([0.2, 0.2, 0.7, 0.7]),
+        torch.tensor([[-3], [-3], [2**40], [2**40]]),
+        NonTensorStack("a", "a", "b", "b"),
+    ],
+)
+def test_trajectories_may_have_any_names(ids: object) -> None:
+    read = read_transitions(labelled(line(4).exclude(("next", "done")), ids))
+    assert read.joined.tolist() == [True, False, True, False]
 
 
 def test_rows_with_a_flag_are_taken_as_they_are() -> None:
@@ -359,6 +386,41 @@ def test_changes_lost_in_the_digits_of_large_values_are_told(offset: float) -> N
         fit_dynamics(data, observation_key="seen", hidden=(8,), max_epochs=1)
     digits = [str(one.message) for one in told if "per step" in str(one.message)]
     assert [message[:22] for message in digits] == ["'seen'[1] changes by 0"] * (offset == 5e6)
+
+
+@pytest.mark.parametrize(
+    ("of_x", "of_u", "told"),
+    [
+        (1.0, 1.0, []),
+        (1e-7, 1.0, ["'observation'[0] changes", "'observation'[1] changes"]),
+        (1.0, 1e-6, ["'action'[0] varies"]),
+    ],
+)
+def test_units_that_are_too_large_for_the_model_are_told(
+    of_x: float, of_u: float, told: list[str]
+) -> None:
+    """A micrometre in metres is no constant, and no want of data."""
+    torch.manual_seed(0)
+    x, u = torch.randn(500, 2), torch.randn(500, 1)
+    change = 0.3 * torch.cat([x[:, 1:], u], -1)
+    data = TensorDict({"observation": of_x * x, "action": of_u * u}, [500])
+    data["next", "observation"] = of_x * (x + change)
+
+    def fitted(**settings: float) -> tuple[list[str], float]:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            model = fit_dynamics(data, hidden=(32,), batch_size=64, max_epochs=100, **settings)
+        assert model.quality is not None
+        return [str(one.message) for one in caught], min(model.quality.explained)
+
+    messages, explained = fitted()
+    small = [message for message in messages if "std_floor" in message]
+    assert [message.partition(" by")[0] for message in small] == told
+    if told:
+        assert explained < 0.8
+        floor = min(float(message.rpartition(" ")[2]) for message in small)
+        messages, explained = fitted(std_floor=floor)
+    assert not messages and explained > 0.95
 
 
 def test_inputs_that_never_vary_are_ignored_and_told() -> None:

@@ -88,6 +88,17 @@ def test_animation(tmp_path):
     assert abs(lows[0] - 100) <= 2 and abs(lows[-1] - 200) <= 2
 
 
+@pytest.mark.parametrize("dt", [0.001, 0.008, 0.016, 0.025, 0.05])
+def test_animations_of_any_step_take_the_time_that_they_show(tmp_path, dt):
+    rows = {"off": [np.full((30, 40, 3), 2 * k, np.uint8) for k in range(100)]}
+    with Image.open(animation(rows, tmp_path / "a.gif", dt=dt)) as image:
+        duration = 0
+        for index in range(image.n_frames):
+            image.seek(index)
+            duration += image.info["duration"]
+    assert abs(duration - 1000 * 100 * dt) <= 20
+
+
 @pytest.mark.parametrize("draw", [filmstrip, animation])
 def test_bad_rows(draw, tmp_path):
     good = _flat(1, 2)

@@ -7,6 +7,7 @@ import os
 import pickle
 import shlex
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -156,12 +157,45 @@ def test_tensors_in_one_file(episodes: list[Episode]) -> None:
     assert torch.equal(found["next", "observation"], data["next", "observation"])
 
 
+@pytest.mark.parametrize("source", ["data.pt", "data.safetensors", "folder"])
+def test_what_columns_name_counts_beside_the_usual_names(source: str) -> None:
+    rows = TensorDict({"observation": torch.zeros(4, 3), "state": torch.ones(4, 2)}, [4])
+    rows.update({"action": torch.zeros(4, 1), "executed": torch.full((4, 1), 3.0)})
+    rows["next"] = {"observation": torch.zeros(4, 3), "state": torch.ones(4, 2)}
+    rows["next", "l1", "u_exec"] = torch.full((4, 1), 2.0)
+    torch.save(rows.to_dict(), "data.pt")
+    save_file({".".join(key) if isinstance(key, tuple) else key: value.clone()
+               for key, value in rows.items(True, True)}, "data.safetensors")  # fmt: skip
+    rows.memmap("folder")
+    data = read_dataset(source, DatasetColumns(["state"], ["next.l1.u_exec"]))
+    assert data["observation"].shape == data["next", "observation"].shape == (4, 2)
+    assert (data["action"] == 2).all()
+    assert "executed" not in set(data.keys()), "it would count in place of what is named"
+    assert (read_dataset(source)["observation"] == 0).all()
+    for columns, words in {
+        "observation=[speed]": "'speed'|no speed, only action, executed, next.l1.u_exec",
+        "action=[torque]": "no torque, only .*: name it, columns.action",
+        "observation=[executed]": "no next.executed, what followed",
+        "observation=[state,observation]": "have one observation, not state, observation",
+        "episode=run": "columns.episode is of .csv and .npz files",
+        "time=t": "columns.time is of .csv",
+    }.items():
+        key, _, value = columns.partition("=")
+        names: Any = value[1:-1].split(",") if value.startswith("[") else value
+        with pytest.raises((KeyError, ValueError), match=words):
+            read_dataset(source, DatasetColumns(**{key: names}))
+
+
 def test_a_table_needs_names() -> None:
     Path("drive.csv").write_text("t,a,b,u\n0,0,0,1\n0.1,1,0,1\n0.2,2,1,0\n")
     with pytest.raises(ValueError, match="say which columns are what"):
         read_dataset("drive.csv")
     columns = DatasetColumns(["a", "b"], ["u"], time="t")
     assert read_dataset("drive.csv", columns)["next", "observation"].tolist() == [[1, 0], [2, 1]]
+    for mark in (";", "\t"):  # as spreadsheets write it where decimals have commas
+        text = Path("drive.csv").read_text().replace(",", mark)
+        Path("other.csv").write_text("\n" + text)
+        assert (read_dataset("other.csv", columns) == read_dataset("drive.csv", columns)).all()
     arrays = {"x": np.arange(6.0), "u": np.zeros(6), "run": np.array([0, 0, 0, 1, 1, 1])}
     np.savez("drive.npz", **arrays)
     data = read_dataset("drive.npz", DatasetColumns(["x"], ["u"], episode="run"))
@@ -192,6 +226,11 @@ def test_what_is_no_dataset_is_refused_in_one_line(episodes: list[Episode]) -> N
     Path("torn.npz").write_bytes(b"PK")
     Path("torn.safetensors").write_bytes(b"PK")
     torch.save([1, 2], "list.pt")
+    zeros = torch.zeros
+    torch.save({"observation": zeros(3), "action": zeros(3)}, "flat.pt")
+    torch.save({"observation": zeros(3, 2), "action": zeros(2, 1)}, "ragged.pt")
+    save_file({"observation": zeros(3, 2), "next": zeros(3), "next.observation": zeros(3, 2)},
+              "twice.safetensors")  # fmt: skip
     torch.save(TensorDict(a=Bomb()).to_dict(), "bomb.pt")
     write_dataset("pickled", episodes, get_task("inverted_pendulum"), "random")
     Path("pickled/other.pickle").write_bytes(pickle.dumps(Bomb()))
@@ -203,6 +242,9 @@ def test_what_is_no_dataset_is_refused_in_one_line(episodes: list[Episode]) -> N
         "torn.npz": "no readable .npz file",
         "torn.safetensors": "damaged",
         "list.pt": "no dictionary of tensors",
+        "flat.pt": r"with 'observation' of shape \[N, n\]",
+        "ragged.pt": "not one row for each of 'observation'",
+        "twice.safetensors": "'next' and 'next.observation' in it: leave one of them out",
         "bomb.pt": "cannot be read as plain tensors",
         "pickled": "is a pickle, which is not read",
     }.items():
@@ -331,6 +373,19 @@ def test_what_a_command_refuses(
         with pytest.raises(SystemExit):
             main(["dataset", *arguments])
         assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("output", ["file/a.npz", "file/folder"])
+def test_the_place_of_a_dataset_is_looked_at_before_work(
+    output: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("file").touch()
+    command = import_module("torchrl_l1.cli.dataset")
+    monkeypatch.setattr(command, "load_run", lambda _: None)
+    monkeypatch.setattr(command, "record", None)
+    with pytest.raises(SystemExit):
+        main(["dataset", "runs/a", output])
+    assert "something is in the way" in capsys.readouterr().err
 
 
 def test_kill_and_resume_leave_equal_metrics(tmp_path: Path) -> None:

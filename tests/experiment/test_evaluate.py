@@ -473,3 +473,28 @@ def test_filmstrip_has_a_row_for_each_stage_and_controller(
     shown.clear()
     main([*command, str(tmp_path / "one"), "--stage", "cloning"])
     assert shown == ["L1 off", "L1 paper"]
+
+
+def test_filmstrip_is_of_the_worst_value_alone(
+    trained: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Whichever disturbance it is: that of the first one is in every evaluation, undisturbed."""
+    drawn: list[Condition] = []
+
+    def poses(trained: object, cell: Condition, steps: int, seed: int) -> list[int]:
+        drawn.append(cell)
+        return [0]
+
+    monkeypatch.setattr(evaluate_command, "_poses", poses)
+    monkeypatch.setattr(evaluate_command, "rollout_frames", lambda task, poses: [poses])
+    monkeypatch.setattr(evaluate_command, "filmstrip", lambda rows, path, **__: path)
+    monkeypatch.setattr(evaluate_command, "animation", lambda rows, path, **__: path)
+    command = ["evaluate", str(trained), "--episodes", "1", "--l1", "off", "--filmstrip"]
+    for name, values, worst in (("gain", ["1", "0.5"], 0.5), ("bias", ["-1", "0"], -1.0)):
+        main([*command, "--output", str(tmp_path / name), f"--{name}", *values])
+        assert f"Filmstrip at {name} {worst:g}: " in capsys.readouterr().out
+        assert [cell.disturbances[name] for cell in drawn] == [worst]
+        drawn.clear()

@@ -43,6 +43,21 @@ class Numb(Odd):
         return observation
 
 
+class Micro(gymnasium.Env):
+    dt = 0.1
+    observation_space = Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = self.np_random.uniform(-1e-6, 1e-6, 1)
+        return self.state.astype(np.float32), {}
+
+    def step(self, action):
+        self.state = 0.7 * self.state + 1e-6 * action[0]
+        return self.state.astype(np.float32), -1e6 * abs(float(self.state[0])), False, False, {}
+
+
 def wrong(observation, action, next_observation):
     return next_observation[..., 0] + 3.0
 
@@ -70,9 +85,10 @@ def test_a_new_recipe_composes_and_needs_no_fix(
     assert (config.task, config.reward, config.recipe) == (
         "gymnasium/Pendulum-v1", "builtin", "swing",
     )  # fmt: skip
-    main(["check", "swing.yaml", "--steps", "1000"])
+    main(["check", "swing.yaml", "seed=1", "--steps", "1000", "horizon=100"])
     said = capsys.readouterr().out
     assert "fix" not in said.replace("nothing to fix", "")
+    assert said.endswith("torchrl-l1 run swing.yaml seed=1 horizon=100\n")
     assert "the reward function gives the environment's rewards" in said
     with pytest.raises(SystemExit):
         main(["new-task", "swing.yaml", "--from", "gymnasium/Pendulum-v1"])
@@ -115,11 +131,27 @@ def test_all_that_is_odd_is_named(place: Path, capsys: pytest.CaptureFixture[str
     assert "the same seed gives the same episodes" in said
 
 
+def test_units_that_are_too_large_are_named(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["check", "pets/any", "task=odd.py:Micro", "horizon=20", "reward=learned"]
+    command += ["termination=none", "--steps", "800"]
+    with pytest.raises(SystemExit):
+        main(command)
+    said = capsys.readouterr().out
+    assert "fix  'observation'[0] changes by" in said
+    floor = said.partition("in smaller units, or ")[2].split()[0]
+    assert floor.startswith("model.std_floor=")
+    main([*command, floor])
+    assert "nothing to fix" in capsys.readouterr().out
+
+
 def test_what_will_not_do_is_a_line(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, words in (
         (["new-task", "a.txt", "--from", "gymnasium/Pendulum-v1"], "must end in .yaml"),
         (["new-task", "a.yaml", "--from", "odd.py:make_env"], "give horizon=STEPS"),
         (["check", "pets/any", "task=gymnasium/CartPole-v1"], "Discrete(2) as actions"),
+        (["check", "pets/any", "--steps", "9", "task=gymnasium/Pendulum-v1"], "at least 10, got 9"),
     ):
         with pytest.raises(SystemExit):
             main(arguments)

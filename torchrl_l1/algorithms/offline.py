@@ -46,7 +46,7 @@ from torchrl_l1.algorithms.policy_improvement import (
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import read_transitions
 from torchrl_l1.dynamics.network import model_precision
-from torchrl_l1.dynamics.transitions import Data
+from torchrl_l1.dynamics.transitions import Data, check_time_step
 from torchrl_l1.envs import AnyTask, Perturbation, action_bounds
 
 OFFLINE_METRICS: dict[str, str] = {
@@ -177,6 +177,7 @@ class Offline(Algorithm):
         if isinstance(data, ReplayBuffer):
             data = data[:] if len(data) else []
         parts = [data] if isinstance(data, TensorDictBase) else list(data)
+        check_time_step(parts, self.task.dt, f"the task {self.task.name}")
         told = all("executed" in part.keys() for part in parts)  # noqa: SIM118
         executed = self.config.label == "executed" and told
         read = read_transitions(

@@ -95,9 +95,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     except SystemExit:
         _flush(" ".join(arguments[:1]))  # the help that was asked for
         raise
-    overridden = options.command == "campaign" and not any(o.startswith("-") for o in rest)
+    takes_more = options.command in ("campaign", "check")
+    overridden = takes_more and not any(o.startswith("-") for o in rest)
     if rest and options.command != "run" and not overridden:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    if options.command == "check":
+        # Behind an option argparse knows no more of them.
+        options.overrides += rest
     # Imports wait until the arguments are known to be right: torch takes seconds to load.
     from torchrl_l1.experiment.signals import orderly_end
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import re
+from pathlib import Path
 
-from torchrl_l1.experiment.datasets import check_output, write_dataset
+from torchrl_l1.experiment.datasets import check_output, is_minari_name, write_dataset
 from torchrl_l1.experiment.errors import typed_override
 from torchrl_l1.experiment.evaluate import load_run
+from torchrl_l1.experiment.files import make_place
 from torchrl_l1.experiment.recording import QUALITIES, record
 
 
@@ -34,6 +36,8 @@ def dataset_command(options: argparse.Namespace) -> None:
     """``torchrl-l1 dataset``: the dataset, and a line on how good it is."""
     check_output(options.output)
     trained = load_run(options.run_dir)
+    if not is_minari_name(options.output):
+        make_place(Path(options.output))
     found = record(trained, options.quality, options.steps, options.seed, print)
     task = trained.algorithm.task
     algorithm = f"{trained.recipe.algorithm} {options.quality}"

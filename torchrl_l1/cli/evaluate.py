@@ -321,7 +321,10 @@ def evaluate_command(options: argparse.Namespace) -> None:
         shown: dict[str, Any] = {name: [entry.neutral] for name, entry in DISTURBANCES.items()}
         name, worst = _worst(values)
         shown |= {name: [worst], "noise": ["none"], "policy": ["deterministic"]}
-        cells = conditions(**{**values, **shown})
+        # Without the cell of no disturbance, whose rows would have the same names.
+        cells = [
+            cell for cell in conditions(**{**values, **shown}) if cell.disturbances[name] == worst
+        ]
         pictures = plots + write_filmstrip(runs[0], cells, name, options.seed, output)
     for trained in runs:
         own = [row for row in rows if row["run"] == trained.name]

@@ -10,6 +10,7 @@ from torchrl_l1.deployment.play import check_film, film, show_film, side_by_side
 from torchrl_l1.deployment.robust_controller import PRESETS
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.envs.rendering import RenderingUnavailable
+from torchrl_l1.experiment.files import make_place
 from torchrl_l1.experiment.l1_options import OFF
 
 
@@ -46,6 +47,8 @@ def play_command(options: argparse.Namespace) -> None:
         options.weights,
         trusted=options.trust,
     )
+    if output is not None:
+        make_place(output)
     on = options.l1 or robust.preset
     if options.compare and on == OFF:
         raise ValueError("--compare shows L1 off beside L1 on: give --l1 robust, or leave it out")

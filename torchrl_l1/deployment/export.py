@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import copy
 import logging
+import traceback
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, replace
+from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import tensordict
 import torch
+import torchrl
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torch.fx.experimental.symbolic_shapes import GuardOnDataDependentSymNode
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_l1.atomic import write_atomically
@@ -26,11 +31,21 @@ from torchrl_l1.deployment.policies import FunctionPolicy
 from torchrl_l1.deployment.robust_controller import RobustController
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.envs.references import require
+from torchrl_l1.experiment.files import make_place
 
 FORMATS = {".pt": "torchscript", ".ts": "torchscript", ".onnx": "onnx", ".pt2": "export"}
 """What a file holds, by its suffix."""
 
 _aten = torch.ops.aten
+
+# Draws around the recorded steps, and the difference there, as a fraction of half the action's
+# range: rounding counts for more far from the data.
+_DRAWS, _AWAY = 100, 1e-2
+
+_DECIDES = "it decides by the values that it sees, and one way of such a decision would be written"
+
+# Loggers that would show whole programs.
+_LOGGERS = ("torch.onnx", "torch.export", "torch.fx")
 
 Step = Callable[..., Sequence[Tensor]]
 
@@ -55,7 +70,16 @@ class ControlledStep(nn.Module):
         # Neither is registered, and their weights become constants: tracers walk through the
         # attributes of what is, and those of TorchRL's actors raise.
         self.jacobian = ActionJacobian(copy.deepcopy(model).requires_grad_(False))
-        self.policies = () if policy is None else (copy.deepcopy(policy).requires_grad_(False),)
+        self.policies: tuple[TensorDictModuleBase, ...] = ()
+        if policy is not None:
+            copied = copy.deepcopy(policy)
+            for parameter in copied.parameters():
+                parameter.detach_()  # of a copied script parameters are no leaves
+                parameter.requires_grad_(False)
+            self.policies = (copied,)
+            # A trace takes scripts as they are, from what is registered.
+            parts = [part for part in copied.modules() if isinstance(part, torch.jit.ScriptModule)]
+            self.scripts = nn.ModuleList(parts)
         fresh = init([1], model.observation_dim, model.action_dim, config)
         self.fresh = fresh.entries()
 
@@ -135,8 +159,10 @@ def export(
         names of inputs and outputs, and the largest difference.
 
     Raises:
-        ValueError: for another format, a policy that is not made of torch's operations, or a
-            difference above the tolerance.
+        OSError: if the file cannot be written there.
+        ValueError: for another format, a policy that is not made of torch's operations or decides
+            by values in Python, or a difference above the tolerance, or above a hundredth at
+            observations around the recorded ones.
     """
     file = Path(file)
     format = FORMATS.get(file.suffix, "") if format is None else format
@@ -145,6 +171,7 @@ def export(
     if format == "onnx":
         for name in ("onnx", "onnxscript", "onnxruntime"):
             require(name, "onnx")
+    make_place(file)
     config, recorded = _recorded(robust, preset, steps, seed)
     steps = len(recorded)  # the episode may end before
     policy = robust.policy if with_policy else None
@@ -155,7 +182,6 @@ def export(
     first = recorded["observation"][:1]
     given = () if with_policy else (recorded["action"][:1],)
     example = (first, *given, *module.fresh.values())
-    file.parent.mkdir(parents=True, exist_ok=True)
     # In a folder of its own: what is there already stays if this one is no good.
     with torch.no_grad(), _quiet(), TemporaryDirectory() as folder:
         written = Path(folder, f"function{file.suffix}")
@@ -165,19 +191,30 @@ def export(
             if not with_policy:
                 raise
             why = next(iter(str(error).split("\n", 1)), "").strip() or type(error).__name__
+            why = _DECIDES if isinstance(error, GuardOnDataDependentSymNode) else why
+            other = "try .pt2, or " * (format != "export" and why != _DECIDES)
             raise ValueError(
-                f"the policy cannot be written as {format} ({why}): try .pt2, or export L1 alone "
+                f"the policy cannot be written as {format} ({why}): {other}export L1 alone "
                 "(with_policy=False, --without-policy)"
             ) from error
         worst = _compare(step, recorded, module, with_policy)
+        away = _compare_away(step, recorded, module, with_policy, seed)
         content = written.read_bytes()
     half = config.half_range
-    allowed = tolerance * (min(half) if isinstance(half, tuple) else half)
+    half_range = min(half) if isinstance(half, tuple) else half
+    allowed = tolerance * half_range
     if not worst <= allowed:
         raise ValueError(
             f"{file} differs from the original by up to {worst:.3g} action units in {steps} steps, "
             f"and {allowed:.3g} are allowed: a policy that draws random numbers, or that is not "
             "made of torch's operations, cannot be exported (see with_policy, --without-policy)"
+        )
+    if not away <= _AWAY * half_range:
+        raise ValueError(
+            f"{file} is equal to the original along the recorded steps, but differs by up to "
+            f"{away:.3g} action units where these did not lead: the policy decides by what it sees "
+            "in Python or NumPy, of which only one way is written (use torch.where, or see "
+            "with_policy, --without-policy)"
         )
     write_atomically(file, content)
     return Exported(file, inputs, outputs, worst, steps)
@@ -221,9 +258,75 @@ def _compare(
     return worst
 
 
+def _compare_away(
+    step: Step, recorded: TensorDictBase, module: ControlledStep, with_policy: bool, seed: int
+) -> float:
+    """Largest difference of executed inputs at observations and actions around recorded ones.
+
+    What a tracer has taken for a constant shows where an episode of the policy does not lead.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    seen = recorded["observation"]
+    spread = seen.amax(0) - seen.amin(0)
+    spread = torch.where(spread > 0, spread, seen.abs().amax(0).clamp_min(1e-3))
+    state: Sequence[Tensor] = list(module.fresh.values())
+    worst = 0.0
+    for number in range(_DRAWS):
+        row = recorded[number % len(recorded)]
+        size = 10.0 ** torch.empty(1).uniform_(-1.0, 2.0, generator=generator)
+        draw = torch.randn(seen.shape[-1], generator=generator)
+        observation = (row["observation"] + size * spread * draw)[None]
+        given = () if with_policy else (row["action"][None],)
+        expected, *_ = module(observation, *given, *state)
+        executed, *_ = step(observation, *given, *state)
+        same = (executed == expected) | (executed.isnan() & expected.isnan())
+        worst = max(worst, float((executed - expected).abs().masked_fill(same, 0.0).max()))
+        worst = worst if worst == worst else float("inf")
+        _, *state = module(row["observation"][None], *given, *state)
+    return worst
+
+
+class _Policy(nn.Module):
+    """The policy alone, for what looks through its operations."""
+
+    def __init__(self, step: ControlledStep) -> None:
+        super().__init__()
+        self.steps = (step,)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        (step,) = self.steps
+        return step._act(step.policies[0], observation)
+
+
+def _checks_arguments(error: GuardOnDataDependentSymNode) -> bool:
+    """Whether a decision is one of TorchRL's own, as distributions look at what they are given."""
+    files = [Path(frame.filename) for frame in traceback.extract_tb(error.__traceback__)]
+    torchs = Path(torch.__file__).parent
+    own = [file for file in files if not file.is_relative_to(torchs)]
+    libraries = (Path(torchrl.__file__).parent, Path(tensordict.__file__).parent)
+    return any(own[-1].is_relative_to(folder) for folder in libraries)
+
+
+def _refuse_decisions(module: ControlledStep, observation: Tensor) -> None:
+    """Refuse a policy that decides by values: a trace holds the side that was taken, and no word.
+
+    Raises:
+        GuardOnDataDependentSymNode: if it does.
+    """
+    try:
+        torch.export.export(_Policy(module), (observation,))
+    except GuardOnDataDependentSymNode as error:
+        if not _checks_arguments(error):
+            raise
+    except Exception:  # what a program cannot hold for another reason a trace may
+        return
+
+
 def _torchscript(
     module: ControlledStep, example: tuple[Tensor, ...], file: Path, *_: object
 ) -> Step:
+    if module.policies:
+        _refuse_decisions(module, example[0])
     traced = torch.jit.freeze(torch.jit.trace(module, example, check_trace=False).eval())
     torch.jit.save(traced, str(file))
     return torch.jit.load(str(file))
@@ -269,15 +372,16 @@ _WRITERS: dict[str, Callable[..., Step]] = {
 @contextmanager
 def _quiet() -> Any:
     """Without what the exporters say of themselves."""
-    logger = logging.getLogger("torch.onnx")
-    before = logger.level
-    logger.setLevel(logging.ERROR)
+    loggers = {logging.getLogger(name): logging.getLogger(name).level for name in _LOGGERS}
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), redirect_stderr(StringIO()):
             warnings.simplefilter("ignore")
             yield
     finally:
-        logger.setLevel(before)
+        for logger, before in loggers.items():
+            logger.setLevel(before)
 
 
 # ONNX has no triangular factors or solutions: for the few rows of a state they are unrolled.

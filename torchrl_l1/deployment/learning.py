@@ -25,6 +25,7 @@ from torchrl_l1.algorithms.collection import seed_streams, stream_seed
 from torchrl_l1.control import L1Primer, L1Transform, OracleTransform
 from torchrl_l1.control.pipeline import transforms_of
 from torchrl_l1.dynamics import EnsembleDynamics, read_transitions
+from torchrl_l1.dynamics.transitions import check_time_step
 from torchrl_l1.envs import EnvironmentSource
 
 FEW_OBSERVATIONS = 5
@@ -272,17 +273,7 @@ def recorded(
         ValueError: if widths or the time of a step are not the environment's, or there are too few
             transitions.
     """
-    held = data
-    if isinstance(data, ReplayBuffer):
-        held = data[:] if len(data) else []
-    for part in [held] if isinstance(held, TensorDictBase) else held:
-        step = part.get("dt", None) if isinstance(part, TensorDictBase) else None
-        taken = dt if step is None else float(step.double().median())
-        if abs(taken - dt) > 0.02 * dt:
-            raise ValueError(
-                f"the data were recorded with steps of {taken:.4g} s, and the environment takes "
-                f"{dt:.4g} s: resample them, or let its steps be as long"
-            )
+    check_time_step(data, dt, "the environment")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the fit, which reads them too, says what it drops
         found = read_transitions(data, dtype=torch.float32)

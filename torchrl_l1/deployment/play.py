@@ -26,7 +26,7 @@ from torchrl_l1.control import L1Transform
 from torchrl_l1.deployment.learning import policy_transforms
 from torchrl_l1.deployment.robust_controller import RobustController
 from torchrl_l1.envs.references import making, require
-from torchrl_l1.envs.rendering import draw_poses, rollout_frames, write_gif
+from torchrl_l1.envs.rendering import draw_poses, gif_frames, rollout_frames, write_gif
 from torchrl_l1.envs.sources import simulation_of
 from torchrl_l1.experiment.l1_options import OFF
 
@@ -200,12 +200,12 @@ def write_film(frames: Sequence[np.ndarray], file: str | Path, dt: float) -> Pat
     file = Path(file)
     check_film(file)
     file.parent.mkdir(parents=True, exist_ok=True)
-    frames, seconds = _in_real_time(frames, dt)
     if file.suffix == ".gif":
-        images = [Image.fromarray(frame) for frame in frames]
-        duration = max(20, round(1000 * seconds))
+        indices, duration = gif_frames(len(frames), dt)
+        images = [Image.fromarray(frames[index]) for index in indices]
         write_through(file, partial(write_gif, images, duration))
         return file
+    frames, seconds = _in_real_time(frames, dt)
     ffmpeg = require("imageio_ffmpeg", "video")
     height, width = (side - side % 2 for side in frames[0].shape[:2])  # as the format asks
     with TemporaryDirectory() as folder:

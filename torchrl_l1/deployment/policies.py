@@ -226,6 +226,7 @@ def load_policy(
     env: EnvBase,
     normalization: str | None = None,
     weights: str | None = None,
+    search_path: Sequence[str] = (),
 ) -> TensorDictModuleBase:
     """A policy as a TorchRL module that reads ``observation`` and writes ``action``.
 
@@ -250,6 +251,7 @@ def load_policy(
             :func:`~torchrl_l1.envs.vector_environment`.
         normalization: file of the statistics of VecNormalize, a pickle, or ``"none"``.
         weights: file of a state dict to load into the module; pickles are refused in it.
+        search_path: folders for ``FILE.py`` and ``MODULE``, before the working directory.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -259,7 +261,9 @@ def load_policy(
     """
     if normalization is not None and not (isinstance(policy, str) and policy.startswith("sb3:")):
         raise ValueError("normalization belongs to policies of Stable-Baselines3, sb3:FILE.zip")
-    found: Any = _from_source(policy, normalization) if isinstance(policy, str) else policy
+    found: Any = policy
+    if isinstance(policy, str):
+        found = _from_source(policy, normalization, search_path)
     predicts = getattr(found, "predict", None)
     if callable(predicts) and hasattr(getattr(found, "policy", None), "squash_output"):
         # A model of Stable-Baselines3, which knows the normaliser that it was trained behind.
@@ -342,7 +346,7 @@ def _short(error: Exception) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
-def _from_source(source: str, normalization: str | None) -> Any:
+def _from_source(source: str, normalization: str | None, search_path: Sequence[str]) -> Any:
     kind, _, rest = source.partition(":")
     if kind in _FILES and rest:
         if not Path(rest).is_file():
@@ -359,11 +363,11 @@ def _from_source(source: str, normalization: str | None) -> Any:
         return list(load_run(source).algorithm.policies.values())[-1]
     if not rest:
         raise ValueError(f"unknown policy {source!r}; policies are {_FORMS}")
-    return _from_code(source)
+    return _from_code(source, search_path)
 
 
-def _from_code(source: str) -> Any:
-    found = load_attribute(source)
+def _from_code(source: str, search_path: Sequence[str]) -> Any:
+    found = load_attribute(source, search_path)
     if isinstance(found, nn.Module) or not callable(found):
         return found
     try:

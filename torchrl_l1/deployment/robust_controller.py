@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -22,6 +22,7 @@ from torchrl_l1.deployment.learning import policy_transforms
 from torchrl_l1.deployment.policies import Policy, load_policy
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.envs import EnvironmentSource, environment_source, vector_environment
+from torchrl_l1.envs.references import folders_of
 from torchrl_l1.envs.sources import MakeEnv
 from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
@@ -48,7 +49,8 @@ class RobustController:
         model: the learned dynamics.
         configs: settings of L1 by preset, bounds of the action included.
         preset: the one that acts by default.
-        origin: how the policy is found again.
+        origin: how the policy is found again, with ``search_path``, the folders of what
+            policy and environment are named by.
     """
 
     source: EnvironmentSource
@@ -152,6 +154,11 @@ class RobustController:
         kind, _, file = str(origin.get("policy") or "").partition(":")
         if kind in ("sb3", "torchscript", "onnx"):
             origin["policy"] = f"{kind}:{_copied(Path(file), folder, 'policy')}"
+        named = [name for name in (self.source.name, origin.get("policy")) if name]
+        folders = [*(origin.get("search_path") or ()), *folders_of(named, [Path.cwd()])]
+        origin["search_path"] = list(dict.fromkeys(folders))
+        if origin.get("policy") and Path(origin["policy"]).exists():  # a run directory
+            origin["policy"] = str(Path(origin["policy"]).resolve())
         for name in ("normalization", "weights"):
             if origin.get(name) and Path(origin[name]).is_file():
                 origin[name] = _copied(Path(origin[name]), folder, name)
@@ -205,26 +212,34 @@ class RobustController:
         else:
             given = {"normalization": None, "weights": None}
         assert policy is not None
-        source = source_for(stored["environment"] if make_env is None else make_env, policy)
+        search_path = stored.get("search_path") or []
+        named = stored["environment"] if make_env is None else make_env
+        source = source_for(named, policy, search_path)
         return cls(
             source,
-            load_policy(policy, source.one(), **given),
+            load_policy(policy, source.one(), **given, search_path=search_path),
             EnsembleDynamics.load(folder / _MODEL),
             configs,
             stored["preset"],
-            {"policy": policy if isinstance(policy, str) else None, **given},
+            {
+                "policy": policy if isinstance(policy, str) else None,
+                **given,
+                "search_path": search_path,
+            },
         )
 
 
-def source_for(make_env: MakeEnv, policy: Policy) -> EnvironmentSource:
+def source_for(
+    make_env: MakeEnv, policy: Policy, search_path: Sequence[str] = ()
+) -> EnvironmentSource:
     """The environment, with the parts of its observation in the order of a run's policy."""
     run = Path(policy) if isinstance(policy, str) else None
     config = None if run is None else RunDirectory(kept_by(run) or run).config_file
     if config is None or not config.is_file():
-        return environment_source(make_env)
+        return environment_source(make_env, search_path)
     settings = read_config(config)
     if make_env != settings.get("task"):
-        return environment_source(make_env)
+        return environment_source(make_env, search_path)
     source = environment_source(make_env, settings.get("search_path") or ())
     return replace(source, observation_keys=tuple(settings.get("observation_keys") or ()))
 
@@ -245,6 +260,7 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
         if stored["format"] == _FORMAT:
             names = [stored[name] for name in ("environment", "policy", "preset")]
             names += [stored.get(name) for name in ("normalization", "weights")]
+            names += stored.get("search_path") or ()
             if not all(name is None or isinstance(name, str) for name in names):
                 raise TypeError("a name in it is no text")
             configs = {name: L1Config(**values) for name, values in stored["configs"].items()}
@@ -329,7 +345,7 @@ def _of_run(folder: Path) -> RobustController:
         configs[name] = config
     policy = list(run.algorithm.policies.values())[-1]
     model = run.algorithm.acting_dynamics
-    origin = {"policy": str(folder)}
+    origin = {"policy": str(folder), "search_path": list(run.recipe.search_path)}
     source = environment_source(run.recipe.task, run.recipe.search_path)
     source = replace(source, observation_keys=tuple(run.recipe.observation_keys))
     return RobustController(source, policy, model, configs, origin=origin)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -29,6 +30,7 @@ from torchrl_l1.deployment.robust_controller import (
     source_for,
 )
 from torchrl_l1.dynamics import FitConfig, calibrate_filter, fit_dynamics
+from torchrl_l1.envs.references import folders_of
 from torchrl_l1.envs.sources import MakeEnv
 
 MODEL: Mapping[str, Any] = {"hidden": (128, 128)}
@@ -133,8 +135,10 @@ def robustify(
         n = dynamics.observation_dim
         rate = target_switch_rate(n) if switch_rate is None else switch_rate
         epsilon, _ = epsilon_for(dynamics, found, rate)
+    named = [name for name in (make_env, policy) if isinstance(name, str)]
     origin = {
         "policy": policy if isinstance(policy, str) else None,
+        "search_path": folders_of(named, [Path.cwd()]),
         "normalization": normalization,
         "weights": weights,
     }

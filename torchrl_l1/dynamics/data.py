@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,6 +22,8 @@ _Path = str | os.PathLike[str]
 
 # What flags of an episode's end are called, by D4RL, Minari, Gymnasium and TorchRL among others.
 _ENDS = ("done", "terminal", "terminated", "termination", "timeout", "truncated", "truncation")
+
+_FALSE = ("", "0", "0.0", "false", "no")
 
 # Steps of time that differ by more from the usual one are gaps.
 _JITTER = 0.1
@@ -47,7 +50,9 @@ def read_csv(
         path: of the file, its first line the names of the columns.
         observation: columns of the observation, n of them.
         action: columns of the action, m of them.
-        episode: column that numbers or names the episodes; one episode if ``None``.
+        episode: column that numbers or names the episodes; one episode if ``None``. Rows of
+            several may alternate. Where a name comes back after longer blocks of others, as in
+            files that were joined, a new episode begins with a warning, unless there is a time.
         time: column of the time, s. Where it goes back a new episode begins, as it does with a
             warning where a step is not the usual one to within a tenth: a gap.
         delimiter: between the cells.
@@ -60,9 +65,9 @@ def read_csv(
     Raises:
         FileNotFoundError: if there is no such file.
         KeyError: if there is no such column.
-        ValueError: for a cell that is no number, a line with more cells than there are columns, if
-            no two lines follow each other, or if neither episode nor time is given and a column
-            such as ``done`` tells of several episodes.
+        ValueError: for a cell that is no number, a line with more cells than there are columns or
+            without its episode, if no two lines follow each other, or if a column such as
+            ``done`` tells of ends between lines that would follow each other.
 
     Examples:
         >>> from pathlib import Path
@@ -85,21 +90,23 @@ def read_csv(
     numbers = [*observation, *action, *([] if time is None else [time])]
     wanted = [*numbers, *([] if episode is None else [episode])]
     try:
-        columns = _columns(path, wanted, numbers, delimiter, flags=episode is None and time is None)
+        columns = _columns(path, wanted, numbers, delimiter)
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is no text in UTF-8 ({error.reason}): save it as such") from None
     except csv.Error as error:
         raise ValueError(f"{path} is no table of text: {error}") from None
-    for name in columns.keys() - set(wanted):
-        ends = [cell.lower() not in ("", "0", "0.0", "false", "no") for cell in columns[name]]
-        _check_ends(str(path), name, np.array(ends, dtype=bool))
+    ends = {
+        name: np.array([cell.lower() not in _FALSE for cell in columns[name]], dtype=bool)
+        for name in columns
+        if name not in wanted
+    }
     x, u = (
         torch.tensor([columns[name] for name in names], dtype=torch.float64).T
         for names in (observation, action)
     )
     clock = None if time is None else torch.tensor(columns[time], dtype=torch.float64)
     labels = None if episode is None else np.array(columns[episode])
-    return _rows(str(path), x, u, labels, clock)
+    return _rows(str(path), x, u, labels, clock, ends)
 
 
 def read_npz(
@@ -160,9 +167,12 @@ def read_npz(
             raise ValueError(f"{path}: {names} have lengths {sorted(lengths)}, expected one length")
         return torch.cat(parts, -1)
 
-    for key, flags in arrays.items() if episode is None and time is None else ():
-        if _is_end(key) and flags.dtype.kind in "fiub":
-            _check_ends(str(path), key, flags.reshape(-1) != 0)
+    ends = {
+        key: (flags != 0).reshape(len(flags), -1).any(-1)
+        for key, flags in arrays.items()
+        if _is_end(key) and key not in (episode, time)
+        if flags.ndim and flags.size and flags.dtype.kind in "fiub"
+    }
     x, u = side_by_side(observation), side_by_side(action)
     if len(x) == len(u) + 1:
         u = torch.cat([u, u.new_zeros(1, u.shape[-1])])
@@ -174,7 +184,7 @@ def read_npz(
     for name, values in (("action", u), (time, clock), (episode, labels)):
         if values is not None and len(values) != len(x):
             raise ValueError(f"{path}: {name} has {len(values)} rows, the observation {len(x)}")
-    return _rows(str(path), x, u, labels, clock)
+    return _rows(str(path), x, u, labels, clock, ends)
 
 
 def read_minari(dataset: str | MinariDataset, download: bool = False) -> TensorDict:
@@ -227,11 +237,11 @@ def read_minari(dataset: str | MinariDataset, download: bool = False) -> TensorD
 
 
 def _columns(
-    path: _Path, wanted: Sequence[str], numbers: Sequence[str], delimiter: str, flags: bool
+    path: _Path, wanted: Sequence[str], numbers: Sequence[str], delimiter: str
 ) -> dict[str, list[Any]]:
     """Columns of a table by name; those of ``numbers`` as numbers, empty cells as NaN.
 
-    With ``flags`` those too that tell the ends of episodes.
+    Those too that tell the ends of episodes.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file")
@@ -251,7 +261,7 @@ def _columns(
                 raise KeyError(f"{path} has no column {name!r}, only {there}{hint}")
             if header.count(name) > 1:
                 raise ValueError(f"{path} has {header.count(name)} columns {name!r}: rename them")
-        extra = [name for name in header if flags and _is_end(name) and name not in wanted]
+        extra = [name for name in header if _is_end(name) and name not in wanted]
         places = {name: header.index(name) for name in [*wanted, *extra]}
         columns: dict[str, list[Any]] = {name: [] for name in places}
         for line in lines:
@@ -266,14 +276,26 @@ def _columns(
                 cell = line[place].strip() if place < len(line) else ""
                 if name in numbers:
                     try:
-                        columns[name].append(float(cell or "nan"))
+                        columns[name].append(_number(cell))
                     except ValueError:
+                        remedy = (
+                            "decimals stand behind a point"
+                            if re.fullmatch(r"[-+]?\d*,\d+", cell)
+                            else "where there is no value, the cell is empty"
+                        )
                         raise ValueError(
-                            f"{path}, line {lines.line_num}, column {name!r}: {cell!r} is no number"
+                            f"{path}, line {lines.line_num}, column {name!r}: {cell!r} is no "
+                            f"number; {remedy}"
                         ) from None
                 else:
                     columns[name].append(cell)
     return columns
+
+
+def _number(cell: str) -> float:
+    if "_" in cell:  # which Python takes for a separator of digits
+        raise ValueError
+    return float(cell or "nan")
 
 
 def _is_end(name: str) -> bool:
@@ -291,21 +313,72 @@ def _check_ends(path: str, name: str, ends: np.ndarray) -> None:
         )
 
 
+def _check_no_end_within(path: str, name: str, ends: Tensor, joined: Tensor) -> None:
+    """Refuse a file that tells of ends after which an episode would go on.
+
+    A flag may stand in the row whose action ended the episode, with the last observation behind
+    it, so that only a second row behind it is one too many.
+    """
+    count = int((ends[:-2] & joined[:-1] & joined[1:]).sum())
+    if count:
+        raise ValueError(
+            f"{path} tells by {name!r} of {count} ends within what episode and time say are single "
+            "episodes, and steps across them would be taken for the plant's: name what numbers "
+            "all episodes as episode, such as the running count of their starts; leave out rows "
+            "behind an end; or rename the column if it is of something else"
+        )
+
+
+def _episodes(path: str, labels: np.ndarray) -> Tensor:
+    """Numbers of the episodes that rows are labelled with."""
+    missing = np.array([str(label).lower() in ("", "nan") for label in labels.tolist()], dtype=bool)
+    if missing.any():
+        raise ValueError(
+            f"{path}: {int(missing.sum())} of {len(labels)} rows name no episode, row "
+            f"{int(missing.argmax()) + 1} first: fill that in, or leave them out"
+        )
+    return torch.from_numpy(np.unique(labels, return_inverse=True)[1].reshape(-1))
+
+
 def _rows(
-    path: str, x: Tensor, u: Tensor, labels: np.ndarray | None, clock: Tensor | None
+    path: str,
+    x: Tensor,
+    u: Tensor,
+    labels: np.ndarray | None,
+    clock: Tensor | None,
+    ends: Mapping[str, np.ndarray],
 ) -> TensorDict:
     """Transitions between rows that follow each other."""
     ids = torch.zeros(len(x), dtype=torch.long)
+    blocks, order = ids, torch.arange(len(x))
+    if labels is None and clock is None:
+        for name, flags in ends.items():
+            _check_ends(path, name, flags)
     if labels is not None and len(labels):
-        ids = torch.from_numpy(np.unique(labels, return_inverse=True)[1].reshape(-1))
+        ids = _episodes(path, labels)
+        blocks[1:] = (ids[1:] != ids[:-1]).cumsum(0)
+        again = int(blocks[-1]) + 1 - len(ids.unique())
+        # Rows of episodes that were recorded at once alternate; joined files have long blocks.
+        if clock is not None or 4 * int(blocks[-1] + 1) > len(ids):
+            blocks = torch.zeros_like(ids)
+        elif again:
+            warnings.warn(
+                f"{path}: names of episodes come back {again} times after others: a new episode "
+                "begins at each; give every episode a name of its own",
+                stacklevel=3,
+            )
         order = ids.argsort(stable=True)
-        x, u, ids = x[order], u[order], ids[order]
+        x, u, ids, blocks = x[order], u[order], ids[order], blocks[order]
         clock = None if clock is None else clock[order]
-    joined = ids[1:] == ids[:-1]
+    joined = (ids[1:] == ids[:-1]) & (blocks[1:] == blocks[:-1])
     extras = {}
     if clock is not None and len(clock) > 1:
         dt, joined = _steps(path, clock, joined)
         extras["dt"] = torch.full((len(x) - 1, 1), dt, dtype=x.dtype)
+    for name, flags in ends.items():
+        ended = torch.zeros(len(x), dtype=torch.bool)
+        ended[: len(flags)] = torch.from_numpy(flags[: len(x)])
+        _check_no_end_within(path, name, ended[order], joined)
     if not joined.any():
         raise ValueError(f"{path} has {len(x)} rows, of which none follows another in its episode")
     trajectory = torch.cat([torch.zeros(1, dtype=torch.long), (~joined).cumsum(0)])
@@ -328,15 +401,20 @@ def _steps(path: str, clock: Tensor, joined: Tensor) -> tuple[float, Tensor]:
     onward = joined & (steps >= 0)
     taken = steps[onward & (steps > 0)]
     if not len(taken):
-        raise ValueError(f"{path}: the time never goes on from one row to the next")
+        raise ValueError(
+            f"{path}: the time never goes on from one row to the next: sort the rows by it, or "
+            "look at what numbers the episodes"
+        )
     dt = float(taken.median())
     even = (steps - dt).abs() <= _JITTER * dt
     gaps = int((joined & ~even & ~(steps < 0)).sum())
     if gaps > int(onward.sum()) / 2:
         low, high = float(steps[onward].min()), float(steps[onward].max())
-        raise ValueError(
-            f"{path}: steps of time from {low:.4g} to {high:.4g} s: resample to one sampling time"
-        )
+        back = int((joined & (steps < 0)).sum())
+        remedy = "resample to one sampling time"
+        if 4 * back > int(onward.sum()):
+            remedy = f"the time goes back {back} times, sort the rows by it"
+        raise ValueError(f"{path}: steps of time from {low:.4g} to {high:.4g} s: {remedy}")
     if gaps:
         warnings.warn(
             f"{path}: {gaps} steps of time are not {dt:.4g} s to within a tenth: a new episode "

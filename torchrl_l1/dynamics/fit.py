@@ -233,10 +233,10 @@ def fit_dynamics(
         raise ValueError("cannot fit: the data hold no transitions; collect some first")
     n, m = (transitions.data[key].shape[-1] for key in ("observation", "action"))
     entry_names(n, names, units)
-    transitions.warn_of_gaps(*keys)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(seed))
         dynamics = make_dynamics(n, m, **{"hidden": (128, 128), **settings}).to(here)
+        transitions.warn_of_gaps(*keys, std_floor=dynamics.change_normalizer.std_floor)
         optimizer = torch.optim.Adam(dynamics.parameters(), lr=config.learning_rate)
         fit_to_transitions(dynamics, transitions, config, optimizer, on_epoch)
     if not bool(dynamics.residuals.measured):

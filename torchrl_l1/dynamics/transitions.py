@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
@@ -43,18 +44,23 @@ class Transitions:
     dropped: int
 
     def warn_of_gaps(
-        self, observation_key: NestedKey = "observation", action_key: NestedKey = "action"
+        self,
+        observation_key: NestedKey = "observation",
+        action_key: NestedKey = "action",
+        std_floor: float = 1e-4,
     ) -> None:
         """Warn of what no model can be told by the data.
 
         Args:
             observation_key: what the observation is called where it comes from.
             action_key: what the action is called there.
+            std_floor: the model's smallest standard deviation.
 
         Warns:
-            UserWarning: naming entries of the action that never vary, and entries of the
-                observation whose changes vary by less than 20 steps of their type. What varies by
-                less than 0.0001 counts as constant, as it does for the model.
+            UserWarning: naming entries of the action that never vary, entries whose values or
+                changes vary by less than a tenth of ``std_floor``, as in units that are too large,
+                and entries of the observation whose changes vary by less than 20 steps of their
+                type. What varies by less than ``std_floor`` is not among the last.
         """
         action = self.data["action"]
         for entry in (action == action[:1]).all(0).nonzero().squeeze(-1).tolist():
@@ -66,8 +72,9 @@ class Transitions:
             )
         before, after = self.data["observation"], self.data["next", "observation"]
         spread = (after - before).std(0, correction=0)
+        self._warn_of_units(_name(observation_key), _name(action_key), spread, std_floor)
         step = before.abs().amax(0) * torch.finfo(before.dtype).eps
-        for entry in ((spread > 1e-4) & (spread < 20 * step)).nonzero().squeeze(-1).tolist():
+        for entry in ((spread > std_floor) & (spread < 20 * step)).nonzero().squeeze(-1).tolist():
             kind = str(before.dtype).removeprefix("torch.")
             warnings.warn(
                 f"{_name(observation_key)}[{entry}] changes by {spread[entry]:.2g} per step, and "
@@ -75,6 +82,28 @@ class Transitions:
                 "an offset first",
                 stacklevel=3,
             )
+
+    def _warn_of_units(self, observation: str, action: str, change: Tensor, floor: float) -> None:
+        x, u = self.data["observation"].double(), self.data["action"].double()
+        told = set()
+        for name, what, values, size in (
+            (observation, "changes by {} per step", change, x.abs().amax(0)),
+            (observation, "varies by {}", x.std(0, correction=0), x.abs().amax(0)),
+            (action, "varies by {}", u.std(0, correction=0), u.abs().amax(0)),
+        ):
+            # What is less is the noise of numbers, or of a simulation.
+            noise = (20 * torch.finfo(change.dtype).eps * size).clamp_min(1e-9)
+            small = (values > noise) & (values < 0.1 * floor)
+            for entry in small.nonzero().squeeze(-1).tolist():
+                if (name, entry) in told:
+                    continue
+                told.add((name, entry))
+                warnings.warn(
+                    f"{name}[{entry}] {what.format(f'{values[entry]:.2g}')}, next to nothing for a "
+                    f"model with std_floor={floor:g}: give it in smaller units, or a std_floor of "
+                    f"{values[entry] / 10:.0e}",
+                    stacklevel=4,
+                )
 
 
 def read_transitions(
@@ -117,7 +146,7 @@ def read_transitions(
     Raises:
         KeyError: if the data lack one of the keys.
         TypeError: for other data.
-        ValueError: if shapes do not fit.
+        ValueError: if shapes do not fit, or widths of the parts differ.
     """
     read: list[TensorDict] = []
     trajectories = 0
@@ -128,6 +157,13 @@ def read_transitions(
         read.append(one)
     if not read:
         return _nothing()
+    for key in ("observation", "action"):
+        widths = sorted({one[key].shape[-1] for one in read})
+        if len(widths) > 1:
+            raise ValueError(
+                f"the data have {key}s of widths {', '.join(map(str, widths))} in their parts: "
+                "leave out those of another system"
+            )
     rows: TensorDictBase = TensorDict.cat(read)
     keep = rows["real"] & _is_transition(rows, (observation_key, action_key))
     kept = keep.nonzero().squeeze(-1)
@@ -139,6 +175,27 @@ def read_transitions(
     if not held_out.any():
         held_out = _hold_out(rows["trajectory"], validation_fraction, seed)
     return Transitions(rows.select("observation", "action", "next"), held_out, joined, dropped)
+
+
+def check_time_step(data: Data, dt: float, whose: str) -> None:
+    """Refuse data of steps of another length, where they hold one (``dt``, s).
+
+    Args:
+        data: as :func:`read_transitions` takes them.
+        dt: time of a step in seconds; that of the data may differ by 2 %, as clocks do.
+        whose: what takes such steps.
+
+    Raises:
+        ValueError: naming both.
+    """
+    for part in _parts(data):
+        step = part.get("dt", None)
+        taken = dt if step is None or not step.numel() else float(step.double().median())
+        if not abs(taken - dt) <= 0.02 * dt:
+            raise ValueError(
+                f"the data were recorded with steps of {taken:.4g} s, and {whose} takes {dt:.4g} "
+                "s: resample them, or let its steps be as long"
+            )
 
 
 def split_validation(
@@ -184,7 +241,9 @@ def _parts(data: Data) -> list[TensorDictBase]:
         if not isinstance(part, TensorDictBase):
             raise TypeError(
                 "data must be a tensordict, several of them or a ReplayBuffer of tensordicts, got "
-                f"{type(part).__name__}"
+                f"{type(part if isinstance(data, list | tuple) else data).__name__}: "
+                "TensorDict(..., batch_size=[N]) makes one of tensors, read_csv and read_npz of "
+                "tables"
             )
         if not part.ndim:
             raise ValueError("data have batch size []: give transitions with a batch size [N]")
@@ -329,8 +388,19 @@ def _name(key: NestedKey) -> str:
 
 def _trajectory_ids(data: TensorDictBase, device: torch.device) -> Tensor | None:
     for key in _TRAJECTORY_IDS:
-        if (value := data.get(key, None)) is not None:
-            return value.reshape(-1).long().to(device)
+        if (value := data.get(key, None)) is None:
+            continue
+        if isinstance(value, Tensor):
+            ids = value.reshape(-1).to(device).unique(return_inverse=True)[1]
+        else:  # names
+            names = np.array(value.tolist() if data.ndim else [], dtype=str).reshape(-1)
+            ids = torch.from_numpy(np.unique(names, return_inverse=True)[1]).to(device)
+        if len(ids) != data.numel():
+            raise ValueError(
+                f"{_name(key)} holds {len(ids)} numbers for {data.numel()} transitions: expected "
+                "one for each"
+            )
+        return ids
     return None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
@@ -191,7 +192,7 @@ def animation(
         rows: frames ``(height, width, 3)`` of each rollout, by the label to print on them.
         path: the GIF file to write; its folder is created.
         every: shows every so many-th frame, the first included.
-        dt: duration of one step in seconds. GIF players round to 10 ms, and slow down below 20.
+        dt: duration of one step in seconds; of short ones not every frame is shown.
 
     Returns:
         The path.
@@ -202,7 +203,9 @@ def animation(
     shown = _checked(rows, every)
     height, width = next(iter(shown.values()))[0].shape[:2]
     images = []
-    for index in range(max(len(frames) for frames in shown.values())):
+    count = max(len(frames) for frames in shown.values())
+    indices, duration = gif_frames(count, dt * every)
+    for index in indices:
         image = Image.new("RGB", (width, height * len(shown)))
         for line, (label, frames) in enumerate(shown.items()):
             frame = Image.fromarray(frames[min(index, len(frames) - 1)])
@@ -211,9 +214,29 @@ def animation(
         images.append(image)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    duration = max(20, round(1000 * dt * every))
     write_through(path, partial(write_gif, images, duration))
     return path
+
+
+def gif_frames(count: int, dt: float) -> tuple[list[int], int]:
+    """Which frames a GIF shows to be in real time, and how long each, ms.
+
+    Times are multiples of 10 ms in the format, and players slow down what is below 20.
+
+    Args:
+        count: of all frames.
+        dt: time between them, s.
+
+    Examples:
+        >>> gif_frames(4, 0.05)
+        ([0, 1, 2, 3], 50)
+        >>> gif_frames(6, 0.008)
+        ([0, 2, 5], 20)
+    """
+    duration = max(20, 10 * round(100 * dt))
+    per_image = duration / (1000 * dt)
+    shown = max(1, math.ceil(count / per_image - 1e-6))
+    return [min(count - 1, int(index * per_image + 1e-6)) for index in range(shown)], duration
 
 
 def write_gif(images: Sequence[Image.Image], duration: int, file: IO[bytes]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
@@ -45,8 +45,9 @@ def read_dataset(source: str, columns: DatasetColumns | None = None) -> TensorDi
 
     Raises:
         FileNotFoundError: if there is no such dataset.
-        KeyError: if it lacks what it should hold.
-        ValueError: if it cannot be read, or is of a kind that is not known.
+        KeyError: if it lacks what it should hold, or what ``columns`` name.
+        ValueError: if it cannot be read, is of a kind that is not known, or has no use for what
+            ``columns`` name.
     """
     columns = columns or DatasetColumns()
     path = Path(source)
@@ -55,9 +56,11 @@ def read_dataset(source: str, columns: DatasetColumns | None = None) -> TensorDi
             raise ValueError("offline learning needs a dataset: set dataset=...")
         if path.is_dir():
             data = _folder(path)
+        elif path.suffix in _TABLES and path.is_file():
+            return _TABLES[path.suffix](path, columns)
         elif path.is_file():
             data = _file(path, columns)
-        elif _MINARI_NAME.fullmatch(source):
+        elif is_minari_name(source):
             data = read_minari(source)
         else:
             raise FileNotFoundError(
@@ -68,15 +71,16 @@ def read_dataset(source: str, columns: DatasetColumns | None = None) -> TensorDi
     return _named(source, data, columns)
 
 
+def is_minari_name(text: str) -> bool:
+    """Whether a text is the name of a dataset of Minari's, such as ``hopper/medium-v0``."""
+    return _MINARI_NAME.fullmatch(text) is not None
+
+
 def _file(path: Path, columns: DatasetColumns) -> TensorDictBase:
-    kinds: dict[str, Callable[[Path, DatasetColumns], TensorDictBase]] = {
-        ".csv": _csv,
-        ".npz": _npz,
-        ".pt": _saved,
-        ".safetensors": _safetensors,
-    }
+    kinds = {".pt": _saved, ".safetensors": _safetensors}
     if path.suffix not in kinds:
-        raise ValueError(f"{path} is no dataset: there are {', '.join(kinds)} files and folders")
+        known = ", ".join([*_TABLES, *kinds])
+        raise ValueError(f"{path} is no dataset: there are {known} files and folders")
     return kinds[path.suffix](path, columns)
 
 
@@ -85,7 +89,11 @@ def _csv(path: Path, columns: DatasetColumns) -> TensorDict:
         raise ValueError(
             f"{path}: say which columns are what, columns.observation=[x,v] columns.action=[u]"
         )
-    return read_csv(path, **vars(columns))
+    # A recipe has no setting for it. What is no text, read_csv says.
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        header = next((line for line in file if line.strip()), "")
+    delimiter = next((mark for mark in (",", ";", "\t") if mark in header), ",")
+    return read_csv(path, **vars(columns), delimiter=delimiter)
 
 
 def _npz(path: Path, columns: DatasetColumns) -> TensorDict:
@@ -104,6 +112,9 @@ def _npz(path: Path, columns: DatasetColumns) -> TensorDict:
         episode=episode,
         time=columns.time,
     )
+
+
+_TABLES: dict[str, Callable[[Path, DatasetColumns], TensorDict]] = {".csv": _csv, ".npz": _npz}
 
 
 def _saved(path: Path, columns: DatasetColumns) -> TensorDictBase:
@@ -132,6 +143,8 @@ def _safetensors(path: Path, columns: DatasetColumns) -> TensorDictBase:
         inner = data
         for place in places:
             inner = inner.setdefault(place, {})
+            if not isinstance(inner, dict):
+                raise ValueError(f"{path} has {place!r} and {name!r} in it: leave one of them out")
         inner[last] = value
     return _tensordict(path, data, columns)
 
@@ -139,12 +152,23 @@ def _safetensors(path: Path, columns: DatasetColumns) -> TensorDictBase:
 def _tensordict(path: Path, data: Any, columns: DatasetColumns) -> TensorDictBase:
     if isinstance(data, TensorDictBase):
         return data
-    key, *more = columns.observation or ["observation"]
-    if more:
-        raise ValueError(f"{path}: tensordicts have one observation, not {columns.observation}")
-    if not isinstance(data, dict) or not isinstance(data.get(key), torch.Tensor):
-        raise ValueError(f"{path} holds no dictionary of tensors with {key!r} among them")
-    return TensorDict(data, batch_size=data[key].shape[:-1])
+    key = columns.observation[0] if columns.observation else "observation"
+    found = data
+    for part in _key(key, data) if isinstance(data, dict) else ():
+        found = found.get(part) if isinstance(found, dict) else None
+    if not isinstance(data, dict) or not isinstance(found, torch.Tensor) or found.ndim < 2:
+        raise ValueError(
+            f"{path} holds no dictionary of tensors with {key!r} of shape [N, n] among them"
+        )
+    try:
+        return TensorDict(data, batch_size=found.shape[:-1])
+    except (RuntimeError, ValueError) as error:
+        raise ValueError(f"{path}: not one row for each of {key!r}: {error}") from error
+
+
+def _key(name: str, keys: Container[str]) -> tuple[str, ...]:
+    """A key by its name, that of one inside another with dots."""
+    return (name,) if name in keys else tuple(name.split("."))
 
 
 def _folder(path: Path) -> TensorDictBase:
@@ -199,16 +223,32 @@ def _of_minari(path: Path) -> TensorDictBase:
 
 
 def _named(source: str, data: TensorDictBase, columns: DatasetColumns) -> TensorDictBase:
-    """The data with the usual names."""
+    """The data with the usual names; what is named counts, whatever else there is."""
+    for name in ("episode", "time"):
+        if getattr(columns, name) is not None:
+            raise ValueError(
+                f"{source}: columns.{name} is of .csv and .npz files; here trajectories are told "
+                "by what TorchRL calls them, leave it out"
+            )
+    data = data.copy()  # what is mapped into memory is locked
     for name, given in (("observation", columns.observation), ("action", columns.action)):
-        if name in data.keys():  # noqa: SIM118
-            continue
-        if len(given) != 1 or data.get(given[0], None) is None:
-            there = ", ".join(sorted(map(str, data.keys())))
-            raise KeyError(f"{source} has no {name}, only {there}: name it, columns.{name}=[...]")
-        data = data.set(name, data[given[0]])
-        if ("next", given[0]) in data.keys(True):
-            data = data.set(("next", name), data["next", given[0]])
+        if len(given) > 1:
+            raise ValueError(f"{source}: tensordicts have one {name}, not {', '.join(given)}")
+        key = _key(given[0], set(data.keys())) if given else (name,)
+        values, wanted = data.get(key, None), ".".join(key)
+        if not isinstance(values, torch.Tensor):
+            keys = (key if isinstance(key, tuple) else (key,) for key in data.keys(True, True))
+            there = ", ".join(sorted(map(".".join, keys)))
+            raise KeyError(f"{source} has no {wanted}, only {there}: name it, columns.{name}=[...]")
+        if key != (name,):
+            data = data.set(name, values)
+            following = data.get(("next", *key), None)
+            if name == "observation":
+                if following is None:
+                    raise KeyError(f"{source} has no next.{wanted}, what followed each step")
+                data = data.set(("next", name), following)
+        if name == "action" and given:
+            data = data.exclude("executed")  # of a run, which would count in its place
     return data
 
 
@@ -288,7 +328,7 @@ def write_dataset(output: str, episodes: Sequence[Episode], task: AnyTask, algor
         path.parent.mkdir(parents=True, exist_ok=True)
         rows: dict[str, Any] = _rows(episodes)
         write_through(path, lambda buffer: np.savez_compressed(buffer, **rows))
-    elif _MINARI_NAME.fullmatch(output):
+    elif is_minari_name(output):
         _write_minari(output, episodes, task, algorithm)
     else:
         _write_folder(path, _transitions(episodes))
@@ -332,9 +372,9 @@ def check_output(output: str) -> None:
         raise ValueError(f"{output} is there already: choose another place, or remove it")
     if path.suffix == ".npz":
         return
-    if path.suffix and not _MINARI_NAME.fullmatch(output):
+    if path.suffix and not is_minari_name(output):
         raise ValueError(f"{output}: datasets are .npz files, folders, or Minari's (name-v0)")
-    if _MINARI_NAME.fullmatch(output):
+    if is_minari_name(output):
         try:
             import minari
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import hashlib
 import io
 import os
@@ -116,6 +117,17 @@ def make_folder(folder: Path) -> None:
         probe.unlink()
     except OSError as error:
         raise type(error)(error.errno, error.strerror, str(folder)) from error
+
+
+def make_place(file: Path) -> None:
+    """Make the folder of a file that work will end with, and find out whether it can be written.
+
+    Raises:
+        OSError: with the name of what is in the way.
+    """
+    if file.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(file))
+    make_folder(file.parent)
 
 
 @contextmanager

@@ -270,16 +270,21 @@ def _about_terminations(algorithm: Algorithm, data: TensorDictBase) -> Iterator[
 
 def _about_model(data: TensorDictBase, recipe: RunSettings) -> Iterator[Finding]:
     settings: Any = getattr(recipe, "model", None)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # its words are below
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
         dynamics: EnsembleDynamics = fit_dynamics(
             data,
             seed=recipe.seed,
             hidden=settings.hidden,
             activation=settings.activation,
+            std_floor=settings.std_floor,
             max_epochs=60,
             max_gradient_steps=1500,
         )
+    # Of what else the fit says the words are below.
+    for words in (str(one.message) for one in told if "std_floor" in str(one.message)):
+        text, _, fix = words.partition(": ")
+        yield Finding(text, fix.replace("a std_floor of ", "model.std_floor="))
     quality = dynamics.quality
     assert quality is not None
     explained = [share for share in quality.explained if share == share]
