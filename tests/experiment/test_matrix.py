@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
+from omegaconf import DictConfig
 
 from torchrl_l1.campaign import CampaignError, EvaluationSettings
 from torchrl_l1.cli.evaluate import add_arguments
 from torchrl_l1.envs import DISTURBANCES
+from torchrl_l1.experiment.evaluate import distinct, load_run
 from torchrl_l1.experiment.matrix import (
     SUITE_L1,
     SUITES,
@@ -21,6 +24,7 @@ from torchrl_l1.experiment.matrix import (
     suite,
     undisturbed,
 )
+from torchrl_l1.experiment.run import run
 
 
 def test_conditions_vary_bias_and_gain_apart() -> None:
@@ -125,3 +129,15 @@ def test_conditions_are_named_by_what_is_not_neutral() -> None:
     assert (disturbed(columns), disturbance_words(columns)) == ({"gain": 0.5}, "gain 0.5")
     # As in tables that are older than a disturbance.
     assert disturbance_words({"bias": 1.0}) == "bias 1"
+
+
+def test_a_controller_is_not_tested_again_with_an_epsilon_that_does_not_matter(
+    tiny_recipe: Callable[..., DictConfig],
+) -> None:
+    trained = load_run(run(tiny_recipe("l1=off", "outer_iterations=1")))
+    cells = conditions(l1=["paper", "robust"], epsilon=[0.3, 1.0], policy=["stochastic"])
+    assert [cell.controller for cell in distinct(trained, cells)] == [
+        "paper epsilon=0.3",
+        "paper epsilon=1",
+        "robust",
+    ]

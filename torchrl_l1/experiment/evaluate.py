@@ -31,6 +31,7 @@ from torchrl_l1.experiment.checkpoints import KEPT, kept_by, load_state, single_
 from torchrl_l1.experiment.errors import RunDirectoryError, fitting_into_memory, message
 from torchrl_l1.experiment.files import digest, read_text
 from torchrl_l1.experiment.l1_options import (
+    UNTUNED,
     closest_option,
     l1_option,
     same_controller,
@@ -159,8 +160,9 @@ def _measure_residuals(algorithm: Algorithm, buffer: dict[str, Any]) -> None:
 def distinct(trained: TrainedRun, cells: Sequence[Condition]) -> list[Condition]:
     """Those conditions that differ for a run, with the names of their stages.
 
-    Sampled and mean actions of a planner are the same: of conditions that differ in nothing else
-    the first stays.
+    Sampled and mean actions of a planner are the same, and so is a controller whose operating
+    point follows the executed input, whatever its ``epsilon``: of conditions that differ in nothing
+    else the first stays.
 
     Raises:
         ValueError: for a stage that the run has not.
@@ -169,6 +171,8 @@ def distinct(trained: TrainedRun, cells: Sequence[Condition]) -> list[Condition]
     for cell in cells:
         stage = trained.stage(cell.stage)
         named = replace(cell, stage=stage)
+        if cell.epsilon is not None and _follows(trained, cell):
+            named = replace(named, epsilon=None)
         both_ways = len(kinds_of(trained.algorithm.policies[stage])) > 1
         found.setdefault(named if both_ways else replace(named, policy=""), named)
     return list(found.values())
@@ -325,6 +329,14 @@ def _is_own(trained: TrainedRun, cell: Condition) -> bool:
         return False
     own, task = trained.recipe.l1, trained.algorithm.task
     return same_controller(_tested_l1(own, task, cell), own, task)
+
+
+def _follows(trained: TrainedRun, cell: Condition) -> bool:
+    """Whether the operating point of a test's controller follows the executed input."""
+    if cell.l1 in UNTUNED:
+        return False
+    settings = _tested_l1(trained.recipe.l1, trained.algorithm.task, cell)
+    return settings.filter == "kalman"
 
 
 def _tested_l1(own: L1Settings, task: AnyTask, cell: Condition) -> L1Settings:
