@@ -60,6 +60,14 @@ def test_from_a_policy_to_a_controller_that_python_loads(policy_file, tmp_path, 
     assert "Largest difference in 10 steps" in capsys.readouterr().out
     assert (tmp_path / "policy.pt").exists()
 
+    # Again: it is the same policy. That of another does not take its place.
+    again = ["robustify", "inverted_pendulum", *TINY, "--bias", "0", "--output", "out"]
+    main([*again, "--policy", f"{policy_file.name}:balance"])
+    kept = (output / "controller/controller.json").read_bytes()
+    words = refused([*again, "--policy", f"{policy_file.name}:other"], capsys)
+    assert f"holds the controller of {policy}" in words and "another --output" in words
+    assert (output / "controller/controller.json").read_bytes() == kept
+
 
 @pytest.mark.parametrize(
     ("line", "message"),

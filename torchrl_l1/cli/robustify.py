@@ -13,7 +13,7 @@ import wandb
 from torchrl_l1.checks import check_count
 from torchrl_l1.cli.evaluate import Gathered
 from torchrl_l1.deployment import Assessment, RobustController, robustify
-from torchrl_l1.deployment.robust_controller import PRESETS
+from torchrl_l1.deployment.robust_controller import PRESETS, check_replaces
 from torchrl_l1.envs import DISTURBANCES, SUITES, environment_source
 from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
@@ -87,6 +87,7 @@ def robustify_command(options: argparse.Namespace) -> None:
     output = Path(options.output or Path("runs/robustify", _folder(options.env)))
     if output.exists() and not output.is_dir():
         raise ValueError(f"{output} is a file; choose another --output")
+    check_replaces(output / "controller", options.env, options.policy)
     make_folder(output)
     robust = robustify(
         options.env,

@@ -150,7 +150,7 @@ class RobustController:
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        origin = dict(self.origin)
+        origin = {"given": _whole(self.origin.get("policy")), **self.origin}
         kind, _, file = str(origin.get("policy") or "").partition(":")
         if kind in ("sb3", "torchscript", "onnx"):
             origin["policy"] = f"{kind}:{_copied(Path(file), folder, 'policy')}"
@@ -225,6 +225,7 @@ class RobustController:
                 "policy": policy if isinstance(policy, str) else None,
                 **given,
                 "search_path": search_path,
+                "given": stored.get("given"),
             },
         )
 
@@ -274,6 +275,34 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
         f"{file} has the format {stored['format']!r}, and this version reads {_FORMAT}: robustify "
         "the policy again"
     )
+
+
+def check_replaces(folder: Path, environment: str, policy: str) -> None:
+    """Refuse a folder with the controller of another policy or environment.
+
+    Raises:
+        ValueError: naming what it holds.
+    """
+    try:
+        stored, _ = _read(folder / _FILE)
+    except (FileNotFoundError, ValueError):  # nothing that is of use
+        return
+    held = (stored["environment"], stored.get("given"))
+    if held[1] is not None and held != (environment, _whole(policy)):
+        raise ValueError(
+            f"{folder} holds the controller of {held[1]} in {held[0]}: give another --output, or "
+            "remove it"
+        )
+
+
+def _whole(policy: str | None) -> str | None:
+    """What names a policy, with the whole path of the file or folder in it."""
+    if policy is None:
+        return None
+    for part in (policy, *policy.split(":", 1)):
+        if part and Path(part).exists():
+            return policy.replace(part, str(Path(part).resolve()))
+    return policy
 
 
 def _check_runs_nothing(folder: Path, stored: dict[str, Any]) -> None:
