@@ -295,6 +295,28 @@ def test_counts_of_pairs_are_those_of_the_table() -> None:
         assert share in text, arm
 
 
+def test_in_how_many_cells_of_mbmf_l1_is_ahead_is_quoted() -> None:
+    text = " ".join(section("docs/studies/mbmf.md", "**The other ten cells**").split())
+    differences: dict[str, list[float]] = {}
+    with (RESULTS / "mbmf_rest/pairs.csv").open(newline="") as handle:
+        for row in csv.DictReader(handle):
+            differences.setdefault(row["policy"], []).extend(map(float, row["differences"].split()))
+            hopper = (row["task"], row["policy"]) == ("hopper", "stochastic")
+            assert not hopper or float(row["difference_mean"]) < 0
+    with (RESULTS / "mbmf_rest/stages.csv").open(newline="") as handle:
+        for row in csv.DictReader(handle):
+            if row["difference_mean"]:
+                differences.setdefault(row["stage"], []).append(float(row["difference_mean"]))
+    counts = {
+        name: f"{sum(one > 0 for one in found)} of {len(found)}"
+        for name, found in differences.items()
+    }
+    assert f"By sampled actions L1 is ahead in {counts['stochastic']}" in text
+    assert f"By mean actions it is ahead in {counts['deterministic']}" in text
+    assert f"(ahead in {counts['shooting']})" in text
+    assert f"clones hardly ({counts['cloning']})" in text
+
+
 def test_what_a_controller_that_hardly_acts_changes_is_quoted() -> None:
     added, differences = [], []
     for task in ("hopper", "walker", "half_cheetah"):
