@@ -176,6 +176,8 @@ def test_what_columns_name_counts_beside_the_usual_names(source: str) -> None:
         "observation=[speed]": "'speed'|no speed, only action, executed, next.l1.u_exec",
         "action=[torque]": "no torque, only .*: name it, columns.action",
         "observation=[executed]": "no next.executed, what followed",
+        "observation=[state.x]": "'state.x' of shape|no state.x, only [^\n]*$",
+        "action=[action.u]": "no action.u, only [^\n]*$",
         "observation=[state,observation]": "have one observation, not state, observation",
         "episode=run": "columns.episode is of .csv and .npz files",
         "time=t": "columns.time is of .csv",
