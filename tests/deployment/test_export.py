@@ -95,6 +95,22 @@ def test_policies_that_decide_in_python_are_refused(robust, tmp_path, policy, su
     assert "forward" not in "".join(capfd.readouterr()), "programs of torch's"
 
 
+def test_what_is_no_number_away_from_the_recorded_steps_is_no_agreement(
+    robust, tmp_path, monkeypatch
+):
+    def writer(module, example, file, *_):
+        def step(observation, *state):
+            action, *following = module(observation, *state)
+            return torch.where(observation.abs().max() > 1, torch.nan, action), *following
+
+        file.touch()
+        return step
+
+    monkeypatch.setitem(sys.modules["torchrl_l1.deployment.export"]._WRITERS, "export", writer)
+    with pytest.raises(ValueError, match="differs by up to inf action units"):
+        export(robust, tmp_path / "policy.pt2", steps=3)
+
+
 def test_decisions_in_torch_are_written(robust, tmp_path):
     bang = with_policy(robust, lambda x: torch.where(x[..., 1:2] > 0.5, -1.0, 1.0))
     found = export(bang, tmp_path / "policy.pt", steps=3)

@@ -280,8 +280,8 @@ def _compare_away(
         expected, *_ = module(observation, *given, *state)
         executed, *_ = step(observation, *given, *state)
         same = (executed == expected) | (executed.isnan() & expected.isnan())
-        worst = max(worst, float((executed - expected).abs().masked_fill(same, 0.0).max()))
-        worst = worst if worst == worst else float("inf")
+        difference = (executed - expected).abs().masked_fill(same, 0.0)
+        worst = max(worst, float(difference.nan_to_num(nan=torch.inf).max()))
         _, *state = module(row["observation"][None], *given, *state)
     return worst
 
