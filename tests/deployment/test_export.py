@@ -135,6 +135,32 @@ def test_scripts_and_checks_of_distributions_are_written(robust, tmp_path):
         assert found.error < 1e-5
 
 
+class Checks(torch.nn.Module):
+    """Decides by what it holds itself, and refuses what is no observation."""
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("count", torch.tensor(3.0))
+        self.linear = torch.nn.Linear(4, 1)
+
+    def forward(self, x):
+        assert x.isfinite().all(), "not finite"
+        if (x.abs() > 1).any():
+            raise ValueError("out of range")
+        return self.linear(x / 2 if self.count > 1 else x)
+
+
+class ChecksAndDecides(Checks):
+    def forward(self, x):
+        return super().forward(x) * (-1 if x[0, 1] > 0.5 else 1)
+
+
+def test_checks_and_decisions_by_what_a_policy_holds_are_none_by_what_it_sees(robust, tmp_path):
+    assert export(with_policy(robust, Checks()), tmp_path / "policy.pt", steps=3).error < 1e-5
+    with pytest.raises(ValueError, match="decides by the values that it sees"):
+        export(with_policy(robust, ChecksAndDecides()), tmp_path / "other.pt", steps=3)
+
+
 def test_the_place_is_looked_at_before_work(robust, tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     (tmp_path / "folder.pt").mkdir()
