@@ -95,6 +95,14 @@ def test_what_is_named_is_found_from_any_folder(robust, policy_file, tmp_path, m
     expected = balance(data["observation"]).clamp(-3.0, 3.0)
     torch.testing.assert_close(loaded.policy(data)["action"], expected)
     assert loaded.source.name == "own_policy.py:make_env"
+    # What is named anew is that of here, and the controller's from then on.
+    other = RobustController.load("../controller", policy="own_policy.py:balance")
+    there = data["observation"] @ torch.tensor([-9.0, 0.0, 1.0, 2.0])
+    torch.testing.assert_close(other.policy(data)["action"][:, 0], there.clamp(-3.0, 3.0))
+    stored = json.loads((other.save("other") / "controller.json").read_text())
+    assert stored["given"] == f"{Path('own_policy.py').resolve()}:balance"
+    kept = RobustController.load("other").policy(data)["action"]
+    torch.testing.assert_close(kept[:, 0], there.clamp(-3.0, 3.0))
     # And from there once more.
     loaded.save("again")
     Path("own_policy.py").unlink()

@@ -205,14 +205,18 @@ class RobustController:
         for what, value in (("make_env", make_env), ("policy", policy)):
             if value is None and not stored["environment" if what == "make_env" else what]:
                 raise ValueError(f"{folder} names no {what}, which was an object: give it again")
+        # What is named anew is looked for here first.
+        anew = [name for name in (make_env, policy) if isinstance(name, str)]
+        search_path = [*folders_of(anew, [Path.cwd()]), *(stored.get("search_path") or ())]
         names = {key: stored.get(key) for key in ("policy", "normalization", "weights")}
+        origin: dict[str, Any] = {"search_path": list(dict.fromkeys(search_path))}
         if policy is None:
             found = {key: _placed(value, folder) for key, value in names.items()}
             policy, given = found.pop("policy"), found
+            origin["given"] = stored.get("given")
         else:
             given = {"normalization": None, "weights": None}
         assert policy is not None
-        search_path = stored.get("search_path") or []
         named = stored["environment"] if make_env is None else make_env
         source = source_for(named, policy, search_path)
         return cls(
@@ -221,12 +225,7 @@ class RobustController:
             EnsembleDynamics.load(folder / _MODEL),
             configs,
             stored["preset"],
-            {
-                "policy": policy if isinstance(policy, str) else None,
-                **given,
-                "search_path": search_path,
-                "given": stored.get("given"),
-            },
+            {"policy": policy if isinstance(policy, str) else None, **given, **origin},
         )
 
 
