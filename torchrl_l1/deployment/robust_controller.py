@@ -150,7 +150,8 @@ class RobustController:
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        origin = {"given": _whole(self.origin.get("policy")), **self.origin}
+        files = (self.origin.get(name) for name in ("policy", "normalization", "weights"))
+        origin = {"given": _given(*files), **self.origin}
         kind, _, file = str(origin.get("policy") or "").partition(":")
         if kind in ("sb3", "torchscript", "onnx"):
             origin["policy"] = f"{kind}:{_copied(Path(file), folder, 'policy')}"
@@ -276,7 +277,13 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
     )
 
 
-def check_replaces(folder: Path, environment: str, policy: str) -> None:
+def check_replaces(
+    folder: Path,
+    environment: str,
+    policy: str,
+    normalization: str | None = None,
+    weights: str | None = None,
+) -> None:
     """Refuse a folder with the controller of another policy or environment.
 
     Raises:
@@ -287,11 +294,17 @@ def check_replaces(folder: Path, environment: str, policy: str) -> None:
     except (FileNotFoundError, ValueError):  # nothing that is of use
         return
     held = (stored["environment"], stored.get("given"))
-    if held[1] is not None and held != (environment, _whole(policy)):
+    if held[1] is not None and held != (environment, _given(policy, normalization, weights)):
         raise ValueError(
             f"{folder} holds the controller of {held[1]} in {held[0]}: give another --output, or "
             "remove it"
         )
+
+
+def _given(policy: str | None, *files: str | None) -> str | None:
+    """What names a policy, with the files that belong to it; ``None`` for an object."""
+    parts = [_whole(policy), *(_whole(file) for file in files if file)]
+    return " with ".join(map(str, parts)) if policy else None
 
 
 def _whole(policy: str | None) -> str | None:
