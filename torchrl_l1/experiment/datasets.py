@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, lazy_stack
 
 from torchrl_l1.algorithms import DatasetColumns
 from torchrl_l1.atomic import write_through
@@ -235,6 +235,9 @@ def _named(source: str, data: TensorDictBase, columns: DatasetColumns) -> Tensor
                 f"{source}: columns.{name} is of .csv and .npz files; here trajectories are told "
                 "by what TorchRL calls them, leave it out"
             )
+    if -1 in data.shape:  # trajectories of different lengths
+        axis = data.shape.index(-1) - 1
+        return lazy_stack([_named(source, part, columns) for part in data.unbind(axis)], axis)
     data = data.copy()  # what is mapped into memory is locked
     for name, given in (("observation", columns.observation), ("action", columns.action)):
         if len(given) > 1:
