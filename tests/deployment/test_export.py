@@ -95,6 +95,22 @@ def test_policies_that_decide_in_python_are_refused(robust, tmp_path, policy, su
     assert "forward" not in "".join(capfd.readouterr()), "programs of torch's"
 
 
+def test_what_is_no_number_away_from_the_recorded_steps_is_no_agreement(
+    robust, tmp_path, monkeypatch
+):
+    def writer(module, example, file, *_):
+        def step(observation, *state):
+            action, *following = module(observation, *state)
+            return torch.where(observation.abs().max() > 1, torch.nan, action), *following
+
+        file.touch()
+        return step
+
+    monkeypatch.setitem(sys.modules["torchrl_l1.deployment.export"]._WRITERS, "export", writer)
+    with pytest.raises(ValueError, match="differs by up to inf action units"):
+        export(robust, tmp_path / "policy.pt2", steps=3)
+
+
 def test_decisions_in_torch_are_written(robust, tmp_path):
     bang = with_policy(robust, lambda x: torch.where(x[..., 1:2] > 0.5, -1.0, 1.0))
     found = export(bang, tmp_path / "policy.pt", steps=3)
@@ -117,6 +133,32 @@ def test_scripts_and_checks_of_distributions_are_written(robust, tmp_path):
     for policy in (f"torchscript:{tmp_path / 'script.pt'}", actor):
         found = export(with_policy(robust, policy), tmp_path / "policy.pt", steps=3)
         assert found.error < 1e-5
+
+
+class Checks(torch.nn.Module):
+    """Decides by what it holds itself, and refuses what is no observation."""
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("count", torch.tensor(3.0))
+        self.linear = torch.nn.Linear(4, 1)
+
+    def forward(self, x):
+        assert x.isfinite().all(), "not finite"
+        if (x.abs() > 1).any():
+            raise ValueError("out of range")
+        return self.linear(x / 2 if self.count > 1 else x)
+
+
+class ChecksAndDecides(Checks):
+    def forward(self, x):
+        return super().forward(x) * (-1 if x[0, 1] > 0.5 else 1)
+
+
+def test_checks_and_decisions_by_what_a_policy_holds_are_none_by_what_it_sees(robust, tmp_path):
+    assert export(with_policy(robust, Checks()), tmp_path / "policy.pt", steps=3).error < 1e-5
+    with pytest.raises(ValueError, match="decides by the values that it sees"):
+        export(with_policy(robust, ChecksAndDecides()), tmp_path / "other.pt", steps=3)
 
 
 def test_the_place_is_looked_at_before_work(robust, tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ from torchrl.envs import GymWrapper
 
 from torchrl_l1.control import L1Config
 from torchrl_l1.deployment import RobustController, environment_source, load_target
-from torchrl_l1.deployment.robust_controller import source_for
+from torchrl_l1.deployment.robust_controller import check_replaces, source_for
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig
 from torchrl_l1.envs import make_env
 from torchrl_l1.experiment.run import run
@@ -62,6 +62,22 @@ def test_files_of_one_name_do_not_overwrite_each_other(robust, tmp_path):
     assert (saved / "weights_model.safetensors").read_text() == "b"
 
 
+def test_other_weights_make_another_policy(robust, policy_file, tmp_path, monkeypatch):
+    for name in ("a.pt", "b.pt"):
+        torch.save({"weight": torch.ones(1, 4), "bias": torch.ones(1)}, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    source = environment_source("inverted_pendulum")
+    origin = {"policy": "own_policy.py:network", "weights": "a.pt"}
+    replace(robust, source=source, origin=origin).save("controller")
+    folder, name = Path("controller"), "own_policy.py:network"
+    check_replaces(folder, "inverted_pendulum", name, None, str(tmp_path / "a.pt"))
+    for weights in ("b.pt", None):
+        with pytest.raises(ValueError, match=r"holds .*own_policy\.py:network with"):
+            check_replaces(folder, "inverted_pendulum", name, None, weights)
+    RobustController.load("controller").save("again")
+    check_replaces(Path("again"), "inverted_pendulum", name, None, "a.pt")
+
+
 def test_files_of_policies_go_into_the_folder(robust, tmp_path):
     file = tmp_path / "policy.pt"
     import warnings
@@ -95,6 +111,14 @@ def test_what_is_named_is_found_from_any_folder(robust, policy_file, tmp_path, m
     expected = balance(data["observation"]).clamp(-3.0, 3.0)
     torch.testing.assert_close(loaded.policy(data)["action"], expected)
     assert loaded.source.name == "own_policy.py:make_env"
+    # What is named anew is that of here, and the controller's from then on.
+    other = RobustController.load("../controller", policy="own_policy.py:balance")
+    there = data["observation"] @ torch.tensor([-9.0, 0.0, 1.0, 2.0])
+    torch.testing.assert_close(other.policy(data)["action"][:, 0], there.clamp(-3.0, 3.0))
+    stored = json.loads((other.save("other") / "controller.json").read_text())
+    assert stored["given"] == f"{Path('own_policy.py').resolve()}:balance"
+    kept = RobustController.load("other").policy(data)["action"]
+    torch.testing.assert_close(kept[:, 0], there.clamp(-3.0, 3.0))
     # And from there once more.
     loaded.save("again")
     Path("own_policy.py").unlink()

@@ -234,6 +234,29 @@ def test_an_end_may_have_its_last_observation_behind_it(tmp_path: Path) -> None:
     assert data["next", "observation"][:, 0].tolist() == [1, 2, 1, 2]
 
 
+@pytest.mark.parametrize("no", ["0", "0.00", "0.000000000000000000e+00", "F", "None", "nan"])
+def test_flags_that_are_not_set_are_none_however_they_are_written(tmp_path: Path, no: str) -> None:
+    """As ``numpy.savetxt`` writes nought, among others."""
+    lines = [f"{x},0,1,{run},{no}" for run in "ab" for x in range(4)]
+    file = write(tmp_path / "log.csv", "angle,rate,torque,run,done", *lines)
+    assert len(read_csv(file, **KEYS, episode="run")) == 6
+
+
+def test_arrays_of_flags_may_lie_on_their_side_and_have_the_name_of_a_measurement(
+    tmp_path: Path,
+) -> None:
+    ends = np.array([0, 0, 1, 0, 0, 1])
+    columns = {"angle": np.arange(6.0), "torque": np.ones(6), "run": ends.cumsum() - ends}
+    file = tmp_path / "log.npz"
+    np.savez(file, **columns, terminal=np.ones(6), done=ends[None])
+    keys = {"observation": ["angle", "terminal"], "action": "torque"}
+    assert len(read_npz(file, **keys, episode="run")) == 4
+    with pytest.raises(ValueError, match="tells by 'done' of 1 episodes that end before the last"):
+        read_npz(file, **keys)
+    np.savez(file, **columns, done=np.where(ends == 1, 1.0, np.nan))
+    assert len(read_npz(file, observation="angle", action="torque", episode="run")) == 4
+
+
 def test_names_of_episodes_that_come_back_begin_new_ones(tmp_path: Path) -> None:
     """Two files in one, of which each counts its episodes from nought."""
     lines = [f"{x},0,1,{run},{x}" for run in (0, 1, 0, 1) for x in range(5)]

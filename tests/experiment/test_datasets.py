@@ -16,7 +16,7 @@ import pytest
 import torch
 from omegaconf import DictConfig
 from safetensors.torch import save_file
-from tensordict import TensorDict
+from tensordict import TensorDict, lazy_stack
 
 from torchrl_l1.algorithms import DatasetColumns
 from torchrl_l1.cli import main
@@ -176,6 +176,8 @@ def test_what_columns_name_counts_beside_the_usual_names(source: str) -> None:
         "observation=[speed]": "'speed'|no speed, only action, executed, next.l1.u_exec",
         "action=[torque]": "no torque, only .*: name it, columns.action",
         "observation=[executed]": "no next.executed, what followed",
+        "observation=[state.x]": "'state.x' of shape|no state.x, only [^\n]*$",
+        "action=[action.u]": "no action.u, only [^\n]*$",
         "observation=[state,observation]": "have one observation, not state, observation",
         "episode=run": "columns.episode is of .csv and .npz files",
         "time=t": "columns.time is of .csv",
@@ -184,6 +186,24 @@ def test_what_columns_name_counts_beside_the_usual_names(source: str) -> None:
         names: Any = value[1:-1].split(",") if value.startswith("[") else value
         with pytest.raises((KeyError, ValueError), match=words):
             read_dataset(source, DatasetColumns(**{key: names}))
+
+
+def test_trajectories_of_different_lengths_in_a_folder() -> None:
+    def line(length: int) -> TensorDict:
+        rows = TensorDict({"state": torch.arange(length + 1.0)[:-1, None]}, [length])
+        rows["action"] = torch.zeros(length, 1)
+        rows["next"] = TensorDict({"state": rows["state"] + 1}, [length])
+        return rows
+
+    lazy_stack([line(3), line(5)]).memmap("ragged")
+    for part in (ragged := lazy_stack([line(3), line(5)])).tensordicts:
+        part["observation"], part["next", "observation"] = part["state"], part["next", "state"]
+    ragged.memmap("usual")
+    for folder, columns in (("ragged", DatasetColumns(["state"])), ("usual", None)):
+        read = read_transitions(read_dataset(folder, columns))
+        assert read.data["observation"].flatten().tolist() == [0, 1, 2, 0, 1, 2, 3, 4]
+    with pytest.raises(KeyError, match="ragged has no observation, only action"):
+        read_dataset("ragged")
 
 
 def test_a_table_needs_names() -> None:

@@ -87,7 +87,8 @@ def robustify_command(options: argparse.Namespace) -> None:
     output = Path(options.output or Path("runs/robustify", _folder(options.env)))
     if output.exists() and not output.is_dir():
         raise ValueError(f"{output} is a file; choose another --output")
-    check_replaces(output / "controller", options.env, options.policy)
+    made_of = (options.env, options.policy, options.normalization, options.weights)
+    check_replaces(output / "controller", *made_of)
     make_folder(output)
     robust = robustify(
         options.env,

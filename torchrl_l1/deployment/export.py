@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import copy
+import linecache
 import logging
+import sys
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
@@ -12,6 +15,7 @@ from dataclasses import dataclass, replace
 from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import FrameType
 from typing import Any
 
 import tensordict
@@ -21,6 +25,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.fx.experimental.symbolic_shapes import GuardOnDataDependentSymNode
+from torch.overrides import TorchFunctionMode
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_l1.atomic import write_atomically
@@ -46,6 +51,11 @@ _DECIDES = "it decides by the values that it sees, and one way of such a decisio
 
 # Loggers that would show whole programs.
 _LOGGERS = ("torch.onnx", "torch.export", "torch.fx")
+
+# By which Python is told values.
+_TOLD = ["__array__", "__bool__", "__contains__", "__float__", "__index__", "__int__", "allclose"]
+_TOLD += ["equal", "is_nonzero", "item", "numpy", "tolist"]
+_QUESTIONS = {getattr(of, name) for of in (Tensor, torch) for name in _TOLD if hasattr(of, name)}
 
 Step = Callable[..., Sequence[Tensor]]
 
@@ -277,12 +287,16 @@ def _compare_away(
         draw = torch.randn(seen.shape[-1], generator=generator)
         observation = (row["observation"] + size * spread * draw)[None]
         given = () if with_policy else (row["action"][None],)
-        expected, *_ = module(observation, *given, *state)
-        executed, *_ = step(observation, *given, *state)
+        now = state
+        _, *state = module(row["observation"][None], *given, *now)
+        try:
+            expected, *_ = module(observation, *given, *now)
+        except Exception:  # a policy may refuse what is out of its range
+            continue
+        executed, *_ = step(observation, *given, *now)
         same = (executed == expected) | (executed.isnan() & expected.isnan())
-        worst = max(worst, float((executed - expected).abs().masked_fill(same, 0.0).max()))
-        worst = worst if worst == worst else float("inf")
-        _, *state = module(row["observation"][None], *given, *state)
+        difference = (executed - expected).abs().masked_fill(same, 0.0)
+        worst = max(worst, float(difference.nan_to_num(nan=torch.inf).max()))
     return worst
 
 
@@ -298,13 +312,53 @@ class _Policy(nn.Module):
         return step._act(step.policies[0], observation)
 
 
-def _checks_arguments(error: GuardOnDataDependentSymNode) -> bool:
-    """Whether a decision is one of TorchRL's own, as distributions look at what they are given."""
-    files = [Path(frame.filename) for frame in traceback.extract_tb(error.__traceback__)]
-    torchs = Path(torch.__file__).parent
-    own = [file for file in files if not file.is_relative_to(torchs)]
-    libraries = (Path(torchrl.__file__).parent, Path(tensordict.__file__).parent)
-    return any(own[-1].is_relative_to(folder) for folder in libraries)
+class _Seen(Tensor):
+    """What depends on the observation."""
+
+
+class _Questions(TorchFunctionMode):
+    """Notes whether Python is told values, and whether what it is told depends on what is seen.
+
+    Attributes:
+        asked: whether it is told any.
+        decided: whether some depend on the observation and are not looked at in a check alone.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked = self.decided = False
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func in _QUESTIONS:
+            self.asked = True
+            self.decided |= _Seen in types and not _is_check(sys._getframe(1))
+        return func(*args, **(kwargs or {}))
+
+
+def _is_check(frame: FrameType) -> bool:
+    """Whether values are looked at by TorchRL, of what it is given, or for an error at most."""
+    torchs, *libraries = (Path(str(m.__file__)).parent for m in (torch, torchrl, tensordict))
+    stack = ((Path(one.f_code.co_filename), line) for one, line in traceback.walk_stack(frame))
+    file, line = next(place for place in stack if not place[0].is_relative_to(torchs))
+    if any(file.is_relative_to(folder) for folder in libraries):
+        return True
+    tests = [
+        node.test
+        for node in ast.walk(ast.parse("".join(linecache.getlines(str(file)))))
+        if isinstance(node, ast.Assert)
+        or (isinstance(node, ast.If) and isinstance(node.body[0], ast.Raise))
+    ]
+    return any(test.lineno <= line <= (test.end_lineno or 0) for test in tests)
+
+
+def _decides(policy: _Policy, observation: Tensor) -> bool:
+    """Whether a policy decides by the values of an observation, as far as can be told."""
+    try:
+        with _Questions() as questions:
+            policy(observation.as_subclass(_Seen))
+    except Exception:  # of what takes no other class of tensors
+        return True
+    return questions.decided or not questions.asked
 
 
 def _refuse_decisions(module: ControlledStep, observation: Tensor) -> None:
@@ -313,10 +367,12 @@ def _refuse_decisions(module: ControlledStep, observation: Tensor) -> None:
     Raises:
         GuardOnDataDependentSymNode: if it does.
     """
+    policy = _Policy(module)
     try:
-        torch.export.export(_Policy(module), (observation,))
-    except GuardOnDataDependentSymNode as error:
-        if not _checks_arguments(error):
+        torch.export.export(policy, (observation,))
+    except GuardOnDataDependentSymNode:
+        # What it holds itself, such as the state of a normaliser, is the same in every step.
+        if _decides(policy, observation):
             raise
     except Exception:  # what a program cannot hold for another reason a trace may
         return

@@ -150,7 +150,8 @@ class RobustController:
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        origin = {"given": _whole(self.origin.get("policy")), **self.origin}
+        files = (self.origin.get(name) for name in ("policy", "normalization", "weights"))
+        origin = {"given": _given(*files), **self.origin}
         kind, _, file = str(origin.get("policy") or "").partition(":")
         if kind in ("sb3", "torchscript", "onnx"):
             origin["policy"] = f"{kind}:{_copied(Path(file), folder, 'policy')}"
@@ -205,14 +206,18 @@ class RobustController:
         for what, value in (("make_env", make_env), ("policy", policy)):
             if value is None and not stored["environment" if what == "make_env" else what]:
                 raise ValueError(f"{folder} names no {what}, which was an object: give it again")
+        # What is named anew is looked for here first.
+        anew = [name for name in (make_env, policy) if isinstance(name, str)]
+        search_path = [*folders_of(anew, [Path.cwd()]), *(stored.get("search_path") or ())]
         names = {key: stored.get(key) for key in ("policy", "normalization", "weights")}
+        origin: dict[str, Any] = {"search_path": list(dict.fromkeys(search_path))}
         if policy is None:
             found = {key: _placed(value, folder) for key, value in names.items()}
             policy, given = found.pop("policy"), found
+            origin["given"] = stored.get("given")
         else:
             given = {"normalization": None, "weights": None}
         assert policy is not None
-        search_path = stored.get("search_path") or []
         named = stored["environment"] if make_env is None else make_env
         source = source_for(named, policy, search_path)
         return cls(
@@ -221,12 +226,7 @@ class RobustController:
             EnsembleDynamics.load(folder / _MODEL),
             configs,
             stored["preset"],
-            {
-                "policy": policy if isinstance(policy, str) else None,
-                **given,
-                "search_path": search_path,
-                "given": stored.get("given"),
-            },
+            {"policy": policy if isinstance(policy, str) else None, **given, **origin},
         )
 
 
@@ -277,7 +277,13 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
     )
 
 
-def check_replaces(folder: Path, environment: str, policy: str) -> None:
+def check_replaces(
+    folder: Path,
+    environment: str,
+    policy: str,
+    normalization: str | None = None,
+    weights: str | None = None,
+) -> None:
     """Refuse a folder with the controller of another policy or environment.
 
     Raises:
@@ -288,11 +294,17 @@ def check_replaces(folder: Path, environment: str, policy: str) -> None:
     except (FileNotFoundError, ValueError):  # nothing that is of use
         return
     held = (stored["environment"], stored.get("given"))
-    if held[1] is not None and held != (environment, _whole(policy)):
+    if held[1] is not None and held != (environment, _given(policy, normalization, weights)):
         raise ValueError(
             f"{folder} holds the controller of {held[1]} in {held[0]}: give another --output, or "
             "remove it"
         )
+
+
+def _given(policy: str | None, *files: str | None) -> str | None:
+    """What names a policy, with the files that belong to it; ``None`` for an object."""
+    parts = [_whole(policy), *(_whole(file) for file in files if file)]
+    return " with ".join(map(str, parts)) if policy else None
 
 
 def _whole(policy: str | None) -> str | None:

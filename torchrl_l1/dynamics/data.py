@@ -23,7 +23,7 @@ _Path = str | os.PathLike[str]
 # What flags of an episode's end are called, by D4RL, Minari, Gymnasium and TorchRL among others.
 _ENDS = ("done", "terminal", "terminated", "termination", "timeout", "truncated", "truncation")
 
-_FALSE = ("", "0", "0.0", "false", "no")
+_FALSE = ("", "false", "f", "no", "n", "none")
 
 # Steps of time that differ by more from the usual one are gaps.
 _JITTER = 0.1
@@ -82,9 +82,7 @@ def read_csv(
         >>> data["dt"][0].item()
         0.1
     """
-    observation, action = (
-        [names] if isinstance(names, str) else list(names) for names in (observation, action)
-    )
+    observation, action = _listed(observation), _listed(action)
     if not observation or not action:
         raise ValueError("observation and action need the name of a column each")
     numbers = [*observation, *action, *([] if time is None else [time])]
@@ -96,7 +94,7 @@ def read_csv(
     except csv.Error as error:
         raise ValueError(f"{path} is no table of text: {error}") from None
     ends = {
-        name: np.array([cell.lower() not in _FALSE for cell in columns[name]], dtype=bool)
+        name: np.array([_is_set(cell) for cell in columns[name]], dtype=bool)
         for name in columns
         if name not in wanted
     }
@@ -153,7 +151,7 @@ def read_npz(
 
     def side_by_side(names: str | Sequence[str]) -> Tensor:
         parts = []
-        for name in [names] if isinstance(names, str) else names:
+        for name in _listed(names):
             values = array(name)
             if values.dtype.kind not in "fiub" or values.ndim not in (1, 2):
                 raise ValueError(
@@ -167,13 +165,14 @@ def read_npz(
             raise ValueError(f"{path}: {names} have lengths {sorted(lengths)}, expected one length")
         return torch.cat(parts, -1)
 
+    x, u = side_by_side(observation), side_by_side(action)
+    names = [one for given in (observation, action, episode, time) for one in _listed(given)]
     ends = {
-        key: (flags != 0).reshape(len(flags), -1).any(-1)
+        key: _set_rows(flags, len(x))
         for key, flags in arrays.items()
-        if _is_end(key) and key not in (episode, time)
+        if _is_end(key) and key not in names
         if flags.ndim and flags.size and flags.dtype.kind in "fiub"
     }
-    x, u = side_by_side(observation), side_by_side(action)
     if len(x) == len(u) + 1:
         u = torch.cat([u, u.new_zeros(1, u.shape[-1])])
     clock = None if time is None else side_by_side(time)
@@ -296,6 +295,25 @@ def _number(cell: str) -> float:
     if "_" in cell:  # which Python takes for a separator of digits
         raise ValueError
     return float(cell or "nan")
+
+
+def _listed(names: str | Sequence[str] | None) -> list[str]:
+    return [names] if isinstance(names, str) else list(names or ())
+
+
+def _is_set(cell: str) -> bool:
+    """Whether a flag is, however it is written."""
+    try:
+        number = float(cell)
+    except ValueError:
+        return cell.lower() not in _FALSE
+    return number != 0 and number == number
+
+
+def _set_rows(flags: np.ndarray, count: int) -> np.ndarray:
+    """In which of so many rows a flag is set."""
+    found = (flags != 0) & (flags == flags)
+    return found.reshape(count if flags.size == count else len(flags), -1).any(-1)
 
 
 def _is_end(name: str) -> bool:

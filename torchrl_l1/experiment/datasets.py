@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, lazy_stack
 
 from torchrl_l1.algorithms import DatasetColumns
 from torchrl_l1.atomic import write_through
@@ -153,9 +153,7 @@ def _tensordict(path: Path, data: Any, columns: DatasetColumns) -> TensorDictBas
     if isinstance(data, TensorDictBase):
         return data
     key = columns.observation[0] if columns.observation else "observation"
-    found = data
-    for part in _key(key, data) if isinstance(data, dict) else ():
-        found = found.get(part) if isinstance(found, dict) else None
+    found = _inside(data, _key(key, data)) if isinstance(data, dict) else None
     if not isinstance(data, dict) or not isinstance(found, torch.Tensor) or found.ndim < 2:
         raise ValueError(
             f"{path} holds no dictionary of tensors with {key!r} of shape [N, n] among them"
@@ -169,6 +167,13 @@ def _tensordict(path: Path, data: Any, columns: DatasetColumns) -> TensorDictBas
 def _key(name: str, keys: Container[str]) -> tuple[str, ...]:
     """A key by its name, that of one inside another with dots."""
     return (name,) if name in keys else tuple(name.split("."))
+
+
+def _inside(data: Any, key: Sequence[str]) -> Any:
+    """What stands under a key; ``None`` where nothing does, or what should hold it is a tensor."""
+    for part in key:
+        data = data.get(part, None) if isinstance(data, dict | TensorDictBase) else None
+    return data
 
 
 def _folder(path: Path) -> TensorDictBase:
@@ -230,19 +235,22 @@ def _named(source: str, data: TensorDictBase, columns: DatasetColumns) -> Tensor
                 f"{source}: columns.{name} is of .csv and .npz files; here trajectories are told "
                 "by what TorchRL calls them, leave it out"
             )
+    if -1 in data.shape:  # trajectories of different lengths
+        axis = data.shape.index(-1) - 1
+        return lazy_stack([_named(source, part, columns) for part in data.unbind(axis)], axis)
     data = data.copy()  # what is mapped into memory is locked
     for name, given in (("observation", columns.observation), ("action", columns.action)):
         if len(given) > 1:
             raise ValueError(f"{source}: tensordicts have one {name}, not {', '.join(given)}")
         key = _key(given[0], set(data.keys())) if given else (name,)
-        values, wanted = data.get(key, None), ".".join(key)
+        values, wanted = _inside(data, key), ".".join(key)
         if not isinstance(values, torch.Tensor):
             keys = (key if isinstance(key, tuple) else (key,) for key in data.keys(True, True))
             there = ", ".join(sorted(map(".".join, keys)))
             raise KeyError(f"{source} has no {wanted}, only {there}: name it, columns.{name}=[...]")
         if key != (name,):
             data = data.set(name, values)
-            following = data.get(("next", *key), None)
+            following = _inside(data, ("next", *key))
             if name == "observation":
                 if following is None:
                     raise KeyError(f"{source} has no next.{wanted}, what followed each step")
