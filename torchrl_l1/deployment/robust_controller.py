@@ -303,18 +303,16 @@ def check_replaces(
 
 def _given(policy: str | None, *files: str | None) -> str | None:
     """What names a policy, with the files that belong to it; ``None`` for an object."""
-    parts = [_whole(policy), *(_whole(file) for file in files if file)]
-    return " with ".join(map(str, parts)) if policy else None
+    named = [policy, *files] if policy else []
+    return " with ".join(_whole(name) for name in named if name) or None
 
 
-def _whole(policy: str | None) -> str | None:
-    """What names a policy, with the whole path of the file or folder in it."""
-    if policy is None:
-        return None
-    for part in (policy, *policy.split(":", 1)):
+def _whole(name: str) -> str:
+    """A name with the whole path of the file or folder in it."""
+    for part in (name, *name.split(":", 1)):
         if part and Path(part).exists():
-            return policy.replace(part, str(Path(part).resolve()))
-    return policy
+            return name.replace(part, str(Path(part).resolve()))
+    return name
 
 
 def _check_runs_nothing(folder: Path, stored: dict[str, Any]) -> None:
