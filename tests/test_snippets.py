@@ -70,6 +70,7 @@ actor = ProbabilisticActor(
 loss = ClipPPOLoss(actor, ValueOperator(nn.Linear(n, 1), in_keys=["observation"]))
 loc, scale = 0.0, 1.0
 observation, state = torch.zeros(1, n), init([1], n, m)
+data = GymEnv("Pendulum-v1").rollout(100)
 """
 
 
@@ -86,7 +87,11 @@ def check_l1(names: dict[str, Any]) -> bool:
 
 
 PAGES = {
-    "README.md": Page(check=augmented("env")),
+    "README.md": Page(
+        smaller={"break_when_any_done=False)": "break_when_any_done=False), max_epochs=2"},
+        ignored=("the model is too poor for L1",),
+        check=augmented("env"),
+    ),
     "docs/quickstart.md": Page(check=augmented("augmented")),
     "docs/tasks.md": Page(),
     "docs/disturbances.md": Page(),

@@ -1,4 +1,4 @@
-"""Records of campaigns: all that their reports are made of, which is the runs without their weights.
+"""Records of campaigns: their runs without the weights, which is all that reports are made of.
 
     python docs/results/records.py pack NAME FOLDER ...
     python docs/results/records.py [NAME ...]
@@ -127,6 +127,7 @@ def report(name: str) -> None:
 
 
 def main() -> None:
+    """Pack, or write reports."""
     match sys.argv[1:]:
         case ["pack", name, *folders] if folders:
             print(f"{HERE / name / RECORDS}: {pack(name, list(map(Path, folders)))} runs")

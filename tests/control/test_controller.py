@@ -76,7 +76,9 @@ def test_controller_and_transform_give_the_same_trajectory(config):
 @pytest.mark.parametrize("preset", ["paper", "robust"])
 def test_environments_that_a_mask_leaves_out_keep_their_state(preset):
     config = getattr(L1Config, preset)(0.04)
-    controller = L1Controller(make_model(), config)
+    model = make_model()
+    model.residuals.calibrated.fill_(True)
+    controller = L1Controller(model, config)
     base = BatchedMujocoEnv("inverted_pendulum", 3, seed=0)
     env = TransformedEnv(base, controller.make_primer())
     torch.manual_seed(2)

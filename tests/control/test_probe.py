@@ -4,6 +4,7 @@ import copy
 import pickle
 import threading
 import warnings
+from dataclasses import replace
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from torchrl.modules import MLP
 from torchrl_l1.control import ActionJacobian, L1Config, L1Transform, init
 from torchrl_l1.control.affine import make_step
 from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.envs import BatchedMujocoEnv
 
 N, M = 3, 1
 
@@ -479,3 +481,19 @@ def test_a_frozen_module_of_torchscript_has_no_mode_and_is_taken():
     x, u = data(4)
     for ours, theirs in zip(ActionJacobian(frozen)(x, u), ActionJacobian(plain)(x, u), strict=True):
         torch.testing.assert_close(ours, theirs)
+
+
+@pytest.mark.parametrize(("settings", "warned"), [({}, True), ({"inflation": 2.0}, False)])
+def test_a_model_that_nobody_has_calibrated_is_told_of_once(settings, warned):
+    model = EnsembleDynamics(4, 1, members=2, hidden=(8,))
+    env = TransformedEnv(
+        BatchedMujocoEnv("inverted_pendulum", 2, seed=0),
+        L1Transform(model, replace(L1Config.robust(0.04), **settings)),
+    )
+    for expected in (warned, False):
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            env.rollout(2)
+        assert ["call calibrate_filter(" in str(each.message) for each in found] == [
+            True
+        ] * expected

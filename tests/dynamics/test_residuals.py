@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from torchrl_l1.control import L1Config
-from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.dynamics import EnsembleDynamics, fit_dynamics
 from torchrl_l1.dynamics.heads import GaussianHead
 from torchrl_l1.dynamics.residuals import (
     Residuals,
@@ -171,6 +173,22 @@ def test_a_missing_force_inflates_the_covariance():
     config = L1Config.robust(0.05, action_low=-1.0, action_high=1.0)
     found = calibrate_filter(residuals, lacking, data, config)
     assert found.inflation >= 8
+
+
+def test_a_model_of_ones_own_data_is_calibrated_with_the_range_of_its_actions():
+    data = episodes([200] * 4).double()
+    settings = {"hidden": (8,), "members": 2, "max_epochs": 2, "batch_size": 64}
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "the model is too poor")
+        model = fit_dynamics(data, **settings)
+        short = fit_dynamics(episodes([15] * 40), **settings)
+    found = model.residuals.inflation.clone(), model.residuals.process_noise.clone()
+    bounds = {"action_low": data["action"].amin(0), "action_high": data["action"].amax(0)}
+    known = L1Config.robust(0.05, **bounds)
+    expected = calibrate_filter(model.residuals, model.value_and_jacobian, data, known)
+    assert model.residuals.calibrated
+    assert found == pytest.approx((expected.inflation, expected.process_noise))
+    assert not short.residuals.calibrated  # no episode has 20 steps
 
 
 def test_a_table_in_double_precision_calibrates_a_model_in_single_precision():

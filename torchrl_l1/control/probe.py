@@ -145,6 +145,19 @@ def probe_covariance(
                 )
 
 
+def warn_of_calibration(dynamics: object) -> None:
+    """Say so where a model does not know how far the residuals that it measures can be trusted."""
+    calibrated = getattr(getattr(dynamics, "residuals", None), "calibrated", None)
+    if isinstance(calibrated, Tensor) and not bool(calibrated):
+        warnings.warn(
+            f"the Kalman filter takes the residuals of {describe(dynamics)} for white noise, since "
+            "nothing has told it how far to trust them: after the fit, call calibrate_filter("
+            "model.residuals, model.value_and_jacobian, data, config) with episodes of at least 20 "
+            "steps, or give inflation",
+            stacklevel=2,
+        )
+
+
 def is_positive(covariance: Tensor, is_whole: bool = True) -> bool:
     """Whether covariances ``(..., n, n)`` are positive definite, or else their diagonal's mean."""
     covariance = covariance.to(torch.promote_types(covariance.dtype, torch.float32))

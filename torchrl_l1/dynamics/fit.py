@@ -21,11 +21,13 @@ from torchrl_l1.checks import (
     check_positive,
     check_within,
 )
+from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics.factory import make_dynamics
 from torchrl_l1.dynamics.loss import EnsembleDynamicsLoss, evaluate_members
 from torchrl_l1.dynamics.model import EnsembleDynamics
 from torchrl_l1.dynamics.network import model_precision, resolve_precision
 from torchrl_l1.dynamics.quality import entry_names
+from torchrl_l1.dynamics.residuals import calibrate_filter
 from torchrl_l1.dynamics.training_step import Members, TrainingStep
 from torchrl_l1.dynamics.transitions import Data, Transitions, read_transitions, two_parts
 from torchrl_l1.dynamics.validation import measure_quality, one_step_residuals
@@ -175,6 +177,11 @@ def fit_dynamics(
 ) -> EnsembleDynamics:
     """A model of the dynamics, fitted to data of one's own, and how good it is.
 
+    Where the data hold 20 steps in a row, what the robust controller needs to know of the model is
+    found as well, as by :func:`~torchrl_l1.dynamics.calibrate_filter` with the range of the
+    recorded actions as their bounds: call that again where the actuators reach further, or on data
+    without the disturbances that are to be cancelled.
+
     Args:
         data: transitions as TorchRL makes them: a replay buffer, a tensordict of any batch size,
             or several of them, see :func:`~torchrl_l1.dynamics.read_transitions`.
@@ -244,7 +251,17 @@ def fit_dynamics(
     dynamics.quality = measure_quality(dynamics, transitions, names, units)
     if dynamics.quality.warning:
         warnings.warn(dynamics.quality.warning, stacklevel=2)
-    return dynamics.eval()
+    _calibrate(dynamics.eval(), transitions.data)
+    return dynamics
+
+
+def _calibrate(dynamics: EnsembleDynamics, data: TensorDictBase) -> None:
+    """With the bounds that the data show; an entry that never varies has those of a unit."""
+    low, high = data["action"].amin(0), data["action"].amax(0)
+    flat = (low == high).to(low)
+    # The filter works step by step: what the time step is does not matter.
+    config = L1Config.robust(1.0, action_low=low - flat, action_high=high + flat)
+    calibrate_filter(dynamics.residuals, dynamics.value_and_jacobian, data, config)
 
 
 def fit_to_transitions(
