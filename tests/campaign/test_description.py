@@ -159,7 +159,7 @@ def test_a_users_recipe_is_found_beside_the_campaign(write: Any, tmp_path: Path)
         (RUNS + "evaluations: [{name: a/b}]", "name must be a word"),
         (RUNS + "evaluations: [{name: e, wher: {}}]", "Did you mean where"),
         (RUNS + "evaluations: [{name: e, l1: [pape]}]", r"\(e\): unknown l1 setting 'pape'"),
-        (RUNS + "evaluations: [{name: e, l1: [robust], alpha: 0.1}]", r"\(e\): L1 robust alpha="),
+        (RUNS + "evaluations: [{name: e, l1: [robust], alpha: 0.1}]", r"\(e\): alpha is given"),
         (RUNS + "evaluations: [{name: e, mass: [1, -1]}]", "mass must be positive, got -1"),
         (RUNS + "evaluations: [{name: e, delay: [0.5]}]", "delay: .* must be whole"),
         (RUNS + "evaluations: [{name: e, noise: [loud]}]", "unknown noise setting 'loud'"),

@@ -138,11 +138,15 @@ def test_objects_are_asked_for_again(robust, tmp_path):
         RobustController.load(tmp_path / "nothing")
 
 
-def test_runs_bring_their_own_model_and_settings(tiny_recipe, tmp_path):
-    run(tiny_recipe("outer_iterations=1", "l1=paper", "l1.epsilon=0.7"))
+@pytest.mark.parametrize(
+    ("l1", "preset"), [("paper", "paper"), ("off", "robust"), ("reference", "robust")]
+)
+@pytest.mark.filterwarnings("ignore:the Kalman filter takes the residuals")  # of short episodes
+def test_runs_bring_their_own_model_and_settings(l1, preset, tiny_recipe, tmp_path):
+    run(tiny_recipe("outer_iterations=1", f"l1={l1}", "l1.epsilon=0.7"))
     robust = load_target(str(tmp_path / "run"))
     assert robust.settings("paper").epsilon == 0.7
-    assert robust.config.filter == "kalman" and robust.source.name == "inverted_pendulum"
+    assert robust.preset == preset and robust.source.name == "inverted_pendulum"
     env = robust.wrap(robust.source.single())
     assert env.rollout(3, robust.policy).shape == (1, 3)
 

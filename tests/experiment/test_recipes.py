@@ -241,6 +241,17 @@ def test_a_users_own_recipe_inherits_a_shipped_one_by_a_line(tmp_path: Path) -> 
     assert typed(str(own), "recipe=other").recipe == "other"
 
 
+@pytest.mark.parametrize("name", available_recipes())
+def test_every_shipped_recipe_can_be_inherited_by_a_line(name: str, tmp_path: Path) -> None:
+    own = tmp_path / "mine.yaml"
+    own.write_text(f"defaults: [{name}, _self_]\nseed: 3\n")
+    task = ["task=swimmer"] if name.endswith("/any") else []
+    mine, shipped = composed(str(own), *task), composed(name, *task)
+    assert (mine.recipe, mine.seed) == ("mine", 3)
+    mine.recipe, mine.seed = shipped.recipe, shipped.seed
+    assert mine == shipped
+
+
 def test_a_recipe_that_is_called_like_a_schema_is_named(tmp_path: Path) -> None:
     """Hydra takes the file for the schema, and would say that it is nested too deeply."""
     (tmp_path / "metrpo_recipe.yaml").write_text("defaults: [/metrpo_recipe, _self_]\n")

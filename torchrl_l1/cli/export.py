@@ -15,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("target", help="a controller's folder or a run directory")
     add("file", help=f"where to; the suffix says what: {', '.join(FORMATS)}")
     add("--format", choices=sorted(set(FORMATS.values())), help="if the suffix does not say")
-    add("--l1", choices=PRESETS, help="what acts; the target's own by default")
+    add("--l1", choices=PRESETS, help="what acts; the target's own by default, else robust")
     add("--without-policy", action="store_true", help="L1 alone: the action is a second input")
     add("--steps", type=int, default=100, help="steps on which it is compared with the original")
     add("--seed", type=int, default=0, help="of those steps")

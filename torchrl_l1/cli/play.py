@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--normalization", metavar="FILE", help="statistics of VecNormalize, see robustify")
     add("--trust", action="store_true", help="run the functions and pickles that a folder names")
     add("--weights", metavar="FILE", help="a state dict to load into the policy's module")
-    add("--l1", choices=(OFF, *PRESETS), help="what acts; the target's own by default")
+    add("--l1", choices=(OFF, *PRESETS), help="what acts; the target's own by default, else robust")
     add("--compare", action="store_true", help="L1 off and on side by side")
     add("--steps", type=int, default=500, help="after which the episode is cut off")
     add("--seed", type=int, default=0, help="of reset and disturbances")

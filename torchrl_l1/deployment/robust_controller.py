@@ -374,10 +374,11 @@ def _of_run(folder: Path) -> RobustController:
     """A training with its own model; with its own L1, where it has one of that kind."""
     run = load_run(folder)
     own, task = run.recipe.l1, run.algorithm.task
+    trained_with = closest_option(own, task)
     configs = {}
     for name in reversed(PRESETS):
         settings = own
-        if closest_option(own, task) != name:
+        if trained_with != name:
             settings = replace(l1_option(name), epsilon=own.epsilon)
         config = l1_config(settings, task)
         assert config is not None
@@ -387,7 +388,8 @@ def _of_run(folder: Path) -> RobustController:
     origin = {"policy": str(folder), "search_path": list(run.recipe.search_path)}
     source = environment_source(run.recipe.task, run.recipe.search_path)
     source = replace(source, observation_keys=tuple(run.recipe.observation_keys))
-    return RobustController(source, policy, model, configs, origin=origin)
+    preset = trained_with if trained_with in PRESETS else PRESETS[0]
+    return RobustController(source, policy, model, configs, preset, origin)
 
 
 @contextmanager

@@ -47,6 +47,16 @@ def l1_option(name: str) -> L1Settings:
     return L1Settings(**group_setting("l1", name))
 
 
+def is_tuned(name: str) -> bool:
+    """Whether epsilon and alpha say something to what a test names: to low-pass filters.
+
+    Examples:
+        >>> is_tuned("paper"), is_tuned("robust"), is_tuned("oracle")
+        (True, False, False)
+    """
+    return name not in UNTUNED and l1_options()[name].filter != "kalman"
+
+
 def check_tested(names: Iterable[str]) -> None:
     """Refuse what frozen policies cannot be tested with.
 

@@ -15,7 +15,7 @@ from typing import Any
 from torchrl_l1.algorithms.collection import ORACLE
 from torchrl_l1.algorithms.facts import KINDS
 from torchrl_l1.envs import DISTURBANCES, SUITES, suite
-from torchrl_l1.experiment.l1_options import OFF, UNTUNED, check_tuning, controller_label
+from torchrl_l1.experiment.l1_options import OFF, check_tuning, controller_label, is_tuned
 from torchrl_l1.experiment.settings import SCHEMAS
 
 _STAGES = [stage.name for one in SCHEMAS.values() for stage in one.builds.facts.named_stages]
@@ -152,16 +152,17 @@ def conditions(of_suite: str | None = None, **values: Sequence[Any]) -> list[Con
     """Every combination of controller, noise, stage and policy with each single disturbance.
 
     Disturbances vary one at a time: the values of the first, then those of each other that are
-    not neutral; or they are those of a suite. Every controller but ``off`` and ``oracle`` is
-    tested with each ``epsilon`` and each ``alpha``; without values, as it is. Without a ``stage``,
-    the last one's policy is tested.
+    not neutral; or they are those of a suite. Every controller with a low-pass filter is tested
+    with each ``epsilon`` and each ``alpha``; without values, and the others, as they are. Without
+    a ``stage``, the last one's policy is tested.
 
     Args:
         of_suite: name of a suite, whose cells stand in place of the values of disturbances.
         **values: by the names of :func:`axes`; those of the axis where none are given.
 
     Raises:
-        ValueError: for any other name, or for disturbances beside a suite.
+        ValueError: for any other name, for disturbances beside a suite, or for values of alpha
+            where no controller has such a filter.
 
     Examples:
         >>> cells = conditions(epsilon=[0.3, 1.0], policy=["stochastic"])
@@ -175,6 +176,11 @@ def conditions(of_suite: str | None = None, **values: Sequence[Any]) -> list[Con
     given = {**every, **values}
     check_suite(of_suite, given)
     disturbances = _one_at_a_time(given) if of_suite is None else suite(of_suite)
+    if given["alpha"] and not any(map(is_tuned, given["l1"])):
+        raise ValueError(
+            f"alpha is given, and none of {', '.join(given['l1'])} has a low-pass filter: leave it "
+            "out, or test paper"
+        )
     tunings = list(product(given["epsilon"] or (None,), given["alpha"] or (None,)))
     cells = product(
         given["stage"] or (None,), given["policy"], given["noise"], disturbances, given["l1"]
@@ -183,7 +189,7 @@ def conditions(of_suite: str | None = None, **values: Sequence[Any]) -> list[Con
         dict.fromkeys(
             Condition(l1, noise, disturbance, policy, epsilon, alpha, stage)
             for stage, policy, noise, disturbance, l1 in cells
-            for epsilon, alpha in ([(None, None)] if l1 in UNTUNED else tunings)
+            for epsilon, alpha in (tunings if is_tuned(l1) else [(None, None)])
         )
     )
 
