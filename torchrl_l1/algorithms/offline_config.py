@@ -29,7 +29,7 @@ class DatasetColumns:
 
     Attributes:
         observation: columns of a CSV file, arrays of an NPZ file, or the key of tensordicts and
-            Minari's dictionaries; ``observation`` if empty.
+            Minari's dictionaries; ``observation`` if empty, but for CSV files, which need it.
         action: likewise; ``action`` if empty.
         episode: column or array that numbers the episodes of a CSV or NPZ file; that of NPZ files
             is ``episode``, if there is one.
