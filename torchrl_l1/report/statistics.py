@@ -169,7 +169,10 @@ def recovered(
     with replacement, and within each one its episodes; what is drawn counts for all three. Every
     policy has the same weight. The resampling has a fixed seed.
 
-    With fewer than three episodes in all that of the gap has no bounds, and there is no share.
+    With fewer than three episodes in all that of the gap has no bounds, and there is no share. With
+    few policies both are too narrow, as any bootstrap of few values: of an oracle that gains
+    nothing on average, with 25 episodes each of policies that differ, a share is found in 24 of 100
+    cases with three policies, in 11 with ten.
 
     Where the disturbance does a policy good, the gap is negative, and 1 still means that all of
     it is undone.
