@@ -226,7 +226,7 @@ def test_page_on_environments_quotes_its_runs() -> None:
             if row["name"] == "half_cheetah":
                 learned.setdefault(row["seed"], []).append(float(row["return_mean"]))
     last = [f"{sum(found[-5:]) / 5:.0f}" for found in learned.values()]
-    assert f"it is {last[0]}, {last[1]} and {last[2]}" in text
+    assert f"at {last[0]}, {last[1]} and {last[2]}. A learned reward" in text
     precision = rows((RESULTS / "precision/table.md").read_text())
     ours = [row["float32"] for row in precision if row["recipe"] == "metrpo half_cheetah"]
     assert f"[at {ours[0]}, {ours[1]} and {ours[2]}]" in text
