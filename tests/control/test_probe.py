@@ -497,3 +497,42 @@ def test_a_model_that_nobody_has_calibrated_is_told_of_once(settings, warned):
         assert ["call calibrate_filter(" in str(each.message) for each in found] == [
             True
         ] * expected
+
+
+def test_each_controller_looks_at_the_covariance_that_it_takes():
+    model = ActionJacobian(WithCovariance(lambda x: torch.zeros(3, 3)))
+    x, u = torch.randn(5, 3), torch.randn(5, 3)
+    paper = L1Config(0.05)
+    make_step(paper, model, False)(init([5], 3, 3, paper), x, u)
+    assert model.ready
+    with pytest.raises(ValueError, match="positive definite"):
+        make_step(ROBUST, model, False)(init([5], 3, 3, ROBUST), x, u)
+
+
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        (ROBUST, "estimator='weighted'"),
+        (WEIGHTED, "estimator='weighted'"),
+        (L1Config(0.05, filter="kalman"), "filter='kalman'"),
+        (L1Config(0.05), None),
+    ],
+)
+def test_a_model_without_a_covariance_is_told_of_where_it_matters(config, words):
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        make_step(config, ActionJacobian(Joined()), False)
+    told = [str(each.message) for each in found]
+    assert [f"{words} knows no covariance of Joined" in each for each in told] == [True] * bool(
+        words
+    )
+
+
+def test_an_ensemble_of_another_type_is_named():
+    model = EnsembleDynamics(3, 1, members=2, hidden=(8,))
+    env = TransformedEnv(GymEnv("Pendulum-v1"), L1Transform(model, dt=0.05, dtype=torch.float64))
+    with pytest.raises(
+        ValueError, match=r"EnsembleDynamics failed .* both torch.float64"
+    ) as caught:
+        env.rollout(2)
+    assert "\n" not in str(caught.value)

@@ -190,7 +190,7 @@ class ActionJacobian:
                 modes = {"analytic": self._analytically}
                 mode = probe(
                     self.dynamics,
-                    lambda x, u: self._analytically(x, u)[0],
+                    self._first_analytic_value,
                     modes,
                     observation,
                     action,
@@ -231,6 +231,12 @@ class ActionJacobian:
         except Exception as error:  # of a model that is made for something else, anything
             raise failure(self.dynamics, observation, action, error) from error
         return self._change(prediction, observation, action)
+
+    def _first_analytic_value(self, observation: Tensor, action: Tensor) -> Tensor:
+        try:
+            return self._analytically(observation, action)[0]
+        except RuntimeError as error:  # torch's, as of a model of another type
+            raise failure(self.dynamics, observation, action, error) from error
 
     def _change(self, prediction: Tensor, observation: Tensor, action: Tensor) -> Tensor:
         self._check_type(prediction, observation)
