@@ -219,7 +219,7 @@ def test_calibration_is_of_the_covariance_that_the_controller_is_told_to_take():
     assert calibrate_filter(residuals, known, data, measured).inflation > 4
     found = calibrate_filter(residuals, known, data, told, residual_covariance=honest)
     assert found.inflation == residuals.inflation == 1
-    with pytest.raises(ValueError, match="residual_covariance=model.residual_covariance"):
+    with pytest.raises(ValueError, match=r"residual_covariance=model\.residual_covariance"):
         calibrate_filter(residuals, known, data, told)
 
 
