@@ -299,9 +299,7 @@ def test_no_environments_get_no_actions():
 
 def test_a_generator_of_another_device_is_named():
     sampler = TrajectorySampler(make_controller().sampler.dynamics.to("meta"), upright)
-    with pytest.raises(
-        ValueError, match=r"on cpu and the model on meta.*torch.Generator\('meta'\)"
-    ):
+    with pytest.raises(ValueError, match=r"is on cpu, but .* on meta.*torch.Generator\('meta'\)"):
         ModelPredictiveController(sampler, CONFIG, -1.0, 1.0, generator=torch.Generator())
 
 

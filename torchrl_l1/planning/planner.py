@@ -64,8 +64,8 @@ class ModelPredictiveController(TensorDictModuleBase):
 
     Raises:
         ValueError: for bounds that are empty or of the wrong width, ``replan_every`` outside the
-            horizon, a generator of another device; at a call, for an observation or state of the wrong shape, and for a reward
-            that is not finite where the system is.
+            horizon, a generator on another device than the model; at a call, for an observation or
+            state of the wrong shape, and for a reward that is not finite where the system is.
         KeyError: at a call, if the observation or the planner's state is missing.
         TypeError: for another kind of settings.
 
@@ -108,8 +108,8 @@ class ModelPredictiveController(TensorDictModuleBase):
         device = sampler.dynamics.device
         if generator is not None and generator.device.type != device.type:
             raise ValueError(
-                f"the generator is on {generator.device} and the model on {device}, where plans are "
-                f"made: give torch.Generator({str(device)!r})"
+                f"the generator is on {generator.device}, but plans are made on {device}, where the "
+                f"model is: give torch.Generator({str(device)!r})"
             )
         self.sampler = sampler
         self.config = config
