@@ -486,6 +486,7 @@ def test_a_frozen_module_of_torchscript_has_no_mode_and_is_taken():
 @pytest.mark.parametrize(("settings", "warned"), [({}, True), ({"inflation": 2.0}, False)])
 def test_a_model_that_nobody_has_calibrated_is_told_of_once(settings, warned):
     model = EnsembleDynamics(4, 1, members=2, hidden=(8,))
+    model.residuals.measure(torch.eye(4))
     env = TransformedEnv(
         BatchedMujocoEnv("inverted_pendulum", 2, seed=0),
         L1Transform(model, replace(L1Config.robust(0.04), **settings)),
@@ -536,3 +537,13 @@ def test_an_ensemble_of_another_type_is_named():
     ) as caught:
         env.rollout(2)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("config", [replace(ROBUST, inflation=2.0), WEIGHTED])
+def test_an_ensemble_whose_residuals_nobody_has_measured_is_told_of(config):
+    model = EnsembleDynamics(3, 1, members=2, hidden=(8,))
+    first = init([2], 3, 1, config), torch.zeros(2, 3), torch.zeros(2, 1)
+    with pytest.warns(UserWarning, match="nothing has measured the residuals of the model Ensemble"):
+        make_step(config, ActionJacobian(model), False)(*first)
+    model.residuals.measure(torch.eye(3))
+    make_step(config, ActionJacobian(model), False)(*first)

@@ -15,7 +15,7 @@ from torchrl_l1.compilation import CompileMode, compiled
 from torchrl_l1.control import kalman_law, law
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import ActionJacobian
-from torchrl_l1.control.probe import FORWARD_MODE, probe_covariance, warn_of_calibration
+from torchrl_l1.control.probe import FORWARD_MODE, probe_covariance, warn_of_residuals
 from torchrl_l1.control.signals import (
     ControlInput,
     diagnose,
@@ -356,8 +356,8 @@ def _prepared(step: StepFunction, config: L1Config, model: ActionJacobian) -> St
                     is_whole=config.estimator == "weighted",
                     is_late=config.filter == "kalman" and config.covariance == "residuals",
                 )
-            if config.filter == "kalman" and config.inflation is None:
-                warn_of_calibration(model.dynamics)
+                has_inflation = config.filter != "kalman" or config.inflation is not None
+                warn_of_residuals(model.dynamics, is_calibrated=has_inflation)
             is_checked = True
             return step(state, observation, u_rl)
 

@@ -108,8 +108,8 @@ class ModelPredictiveController(TensorDictModuleBase):
         device = sampler.dynamics.device
         if generator is not None and generator.device.type != device.type:
             raise ValueError(
-                f"the generator is on {generator.device}, but plans are made on {device}, where the "
-                f"model is: give torch.Generator({str(device)!r})"
+                f"the generator is on {generator.device}, but plans are made on {device}, where "
+                f"the model is: give torch.Generator({str(device)!r})"
             )
         self.sampler = sampler
         self.config = config
