@@ -188,13 +188,7 @@ class ActionJacobian:
             modes: dict[Mode, Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]]
             if self.analytic:
                 modes = {"analytic": self._analytically}
-                mode = probe(
-                    self.dynamics,
-                    self._first_analytic_value,
-                    modes,
-                    observation,
-                    action,
-                )
+                mode = probe(self.dynamics, self._first_analytic_value, modes, observation, action)
             else:
                 self._lift(observation, action)
                 modes = {"forward": self._forward_mode, "reverse": self._reverse_mode}
