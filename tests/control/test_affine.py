@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import itertools
+import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from torchrl_l1.control import (
     init,
     switching_law,
 )
+from torchrl_l1.control.affine import make_step
 from torchrl_l1.dynamics import EnsembleDynamics
 
 
@@ -351,3 +354,51 @@ def test_one_step_of_each_environment_under_vmap(make, kind):
         u, state, _ = augment(config, model, state, x, u_rl)
         for mapped, batched in zip(found, (u, *state.entries().values()), strict=True):
             torch.testing.assert_close(mapped, batched)
+
+
+class WithoutVariance:
+    """A model that takes its residuals for zero."""
+
+    def mean_change(self, observation, action):
+        return 0.1 * observation + 0.2 * action
+
+    def residual_covariance(self, observation, action):
+        return torch.zeros(3, 3)
+
+
+PAPER, ROBUST = L1Config(0.05), L1Config.robust(0.05)
+WEIGHTED = L1Config(0.05, estimator="weighted")
+
+
+def test_each_controller_looks_at_the_covariance_that_it_takes():
+    model, data = ActionJacobian(WithoutVariance()), (torch.zeros(5, 3), torch.zeros(5, 3))
+    make_step(PAPER, model, False)(init([5], 3, 3, PAPER), *data)
+    assert model.ready
+    with pytest.raises(ValueError, match="positive definite"):
+        make_step(ROBUST, model, False)(init([5], 3, 3, ROBUST), *data)
+
+
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        (ROBUST, ["estimator='weighted' knows no covariance of function"]),
+        (WEIGHTED, ["estimator='weighted' knows no covariance of function"]),
+        (L1Config(0.05, filter="kalman"), ["filter='kalman' knows no covariance of function"]),
+        (PAPER, []),
+    ],
+)
+def test_a_model_without_a_covariance_is_told_of_where_it_matters(config, words):
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        make_step(config, ActionJacobian(quadratic), False)
+    assert [str(each.message).partition("'s ")[0] for each in found] == words
+
+
+@pytest.mark.parametrize("config", [replace(ROBUST, inflation=2.0), WEIGHTED])
+def test_an_ensemble_whose_residuals_nobody_has_measured_is_told_of(config):
+    model = EnsembleDynamics(3, 1, members=2, hidden=(8,))
+    first = init([2], 3, 1, config), torch.zeros(2, 3), torch.zeros(2, 1)
+    with pytest.warns(UserWarning, match="nothing has measured the residuals of the model"):
+        make_step(config, ActionJacobian(model), False)(*first)
+    model.residuals.measure(torch.eye(3))
+    make_step(config, ActionJacobian(model), False)(*first)

@@ -118,3 +118,27 @@ def test_a_covariance_that_is_none_is_refused(covariance):
     residual, jacobian = torch.ones(2, 30, 2), torch.ones(2, 30, 2, 1)
     with pytest.raises(ValueError, match=r"positive definite covariance of the shape \(2, 2\)"):
         calibrate(L1Config.robust(0.02, **BOUNDS), residual, jacobian, covariance)
+
+
+def test_a_covariance_of_each_step_is_that_of_its_residual():
+    generator = torch.Generator().manual_seed(3)
+    residual = 0.1 * autocorrelated(4, 30, 3, 0.5)
+    jacobian = torch.randn(4, 30, 3, 2, generator=generator)
+    # In other units at each step, all of it says the same.
+    units = 0.5 + torch.rand(4, 30, 1, generator=generator)
+    config, covariance = L1Config.robust(0.02, **BOUNDS), 0.01 * torch.eye(3)
+    expected = calibrate(config, residual, jacobian, covariance).table
+    varying = units[..., None].square() * covariance
+    found = calibrate(config, units * residual, units[..., None] * jacobian, varying).table
+    for one, other in zip(found, expected, strict=True):
+        assert one == pytest.approx(other, rel=1e-3)
+
+
+def test_the_smallest_inflation_is_found_in_any_order():
+    residual, jacobian = 0.1 * autocorrelated(8, 40, 1, 0.0), torch.full((8, 40, 1, 1), 0.5)
+    config = L1Config.robust(0.02, **BOUNDS)
+    found = [
+        calibrate(config, residual, jacobian, 0.01 * torch.eye(1), inflations=tried).inflation
+        for tried in ((1.0, 4.0, 16.0), (16.0, 1.0, 4.0))
+    ]
+    assert found[0] == found[1]

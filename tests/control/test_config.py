@@ -72,6 +72,11 @@ def test_gains_at_the_default_rate():
         ({"action_low": float("nan")}, "action_low must be a number"),
         ({"project": "yes"}, "project must be True or False"),
         ({"action_low": [True]}, "action_low must be a number"),
+        ({"action_low": float("inf")}, "action_low must not be inf"),
+        ({"action_low": (-1.0, float("inf"))}, "action_low must not be inf"),
+        ({"action_high": float("-inf")}, "action_high must not be -inf"),
+        ({"process_noise": 0.01}, "belong to the Kalman filter: leave them out"),
+        ({"inflation": 2.0}, "belong to the Kalman filter: leave them out"),
     ],
 )
 def test_bad_settings_are_named(settings, message):

@@ -272,7 +272,7 @@ def test_every_face_takes_what_the_model_predicts(net):
 
 
 @pytest.mark.parametrize("preset", [L1Config.paper, L1Config.robust])
-@pytest.mark.filterwarnings("ignore:estimator='weighted' knows no covariance")
+@pytest.mark.filterwarnings("ignore:.* knows no covariance")
 def test_a_batch_without_rows_is_no_first_step(net: Net, preset: Callable[..., L1Config]) -> None:
     """Nothing can be told of a model by it; the first one with rows is looked at."""
     jacobian, config = ActionJacobian(net), preset(0.05, action_low=-1.0, action_high=1.0)
@@ -284,3 +284,12 @@ def test_a_batch_without_rows_is_no_first_step(net: Net, preset: Callable[..., L
         torch.testing.assert_close(executed, action)  # nothing to counteract at a first step
         assert jacobian.ready == (size == 2 or jacobian.ready)
     assert jacobian.ready
+
+
+def test_an_ensemble_of_another_type_is_named() -> None:
+    model = ActionJacobian(EnsembleDynamics(N, M, members=2, hidden=(8,)))
+    with pytest.raises(
+        ValueError, match=r"EnsembleDynamics failed .* both torch\.float64"
+    ) as caught:
+        model.prepare(*data(2))
+    assert "\n" not in str(caught.value)

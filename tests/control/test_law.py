@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchrl_l1.control import L1Config, L1State, init, step
+from torchrl_l1.control import ActionJacobian, L1Config, L1State, augment, init, step
 from torchrl_l1.control.law import project, respond, saturate
 from torchrl_l1.control.least_squares import solve_matched
 
@@ -441,3 +441,20 @@ def test_more_actions_than_observations_are_flagged_and_still_solve():
     solution, flagged = solve_matched(jac, residual)
     assert flagged
     torch.testing.assert_close(jac @ solution, residual, rtol=2e-3, atol=0)
+
+
+@pytest.mark.parametrize("filter", ["low_pass", "kalman"])
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"a_s": (-1.0,) * 3}, "a_s has 3 entries"),
+        ({"action_low": (-1.0,) * 2}, "action_low has 2"),
+    ],
+)
+def test_settings_of_other_widths_are_named(filter, wrong, words):
+    config = L1Config(0.05, filter=filter, **wrong)
+    state, x, u = init([2], 1, 1, config), torch.zeros(2, 1), torch.zeros(2, 1)
+    with pytest.raises(ValueError, match=words):
+        step(config, state, x, u, x, torch.ones(2, 1, 1))
+    with pytest.raises(ValueError, match=words):
+        augment(config, ActionJacobian(lambda x, u: x + u), state, x, u)

@@ -486,6 +486,7 @@ def test_a_frozen_module_of_torchscript_has_no_mode_and_is_taken():
 @pytest.mark.parametrize(("settings", "warned"), [({}, True), ({"inflation": 2.0}, False)])
 def test_a_model_that_nobody_has_calibrated_is_told_of_once(settings, warned):
     model = EnsembleDynamics(4, 1, members=2, hidden=(8,))
+    model.residuals.measure(torch.eye(4))
     env = TransformedEnv(
         BatchedMujocoEnv("inverted_pendulum", 2, seed=0),
         L1Transform(model, replace(L1Config.robust(0.04), **settings)),

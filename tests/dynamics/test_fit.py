@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import warnings
 from copy import deepcopy
 
 import pytest
@@ -291,3 +292,13 @@ def test_an_optimizer_of_another_model_is_refused() -> None:
         fit_ensemble(copy, data, FitConfig(), torch.optim.Adam(model.parameters()))
     for name, value in copy.state_dict().items():
         assert torch.equal(value, before[name])
+
+
+def test_a_seeded_fit_leaves_the_generators_of_other_devices_alone(monkeypatch) -> None:
+    seeds: list[int] = []
+    monkeypatch.setattr(torch.cuda, "manual_seed_all", seeds.append)
+    settings = {"hidden": (4,), "members": 2, "max_epochs": 1}
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "the model is too poor")
+        fit_dynamics(transitions(100), **settings)
+    assert not seeds

@@ -336,3 +336,53 @@ def test_bounds_of_each_entry_of_the_action() -> None:
     action = env.rollout(1)["action"]
     for entry in range(3):
         assert low[entry] <= action[..., entry].min() < action[..., entry].max() <= high[entry]
+
+
+@pytest.mark.parametrize("name", ["policy", "reward", "terminated"])
+def test_a_function_that_writes_to_what_it_is_given_is_named(name: str) -> None:
+    functions: dict[str, Callable[..., Tensor]] = {
+        "policy": lambda x: torch.zeros(2, 1),
+        "reward": reward,
+        "terminated": lambda successor: successor[..., 0] > 9,
+    }
+    given = functions[name]
+
+    def writes(*inputs: Tensor) -> Tensor:
+        inputs[-1][..., 0] -= 100.0
+        return given(*inputs)
+
+    functions[name] = writes
+    start = torch.zeros(2, 2)
+    with pytest.raises(ValueError, match=f"the {name} function writes to what it is given"):
+        imagine(drifting_model(9.0), start=start, horizon=2, action_low=LOW, action_high=HIGH,
+                **functions)  # fmt: skip
+
+
+def test_functions_in_inference_mode_are_called_all_the_same() -> None:
+    with torch.inference_mode():
+        found = imagine(
+            drifting_model(9.0), lambda x: x[:, :1] + 1, reward, torch.zeros(2, 2), 2, LOW, HIGH
+        )
+    assert found["observation"][0, :, 0].tolist() == [0.0, 1.0]
+
+
+def test_the_environment_clips_actions_as_imagine_does() -> None:
+    env = EnsembleModelEnv(
+        drifting_model(9.0), reward, lambda count: torch.zeros(count, 2), -1.0, 1.0, (3,)
+    )
+    found = env.rollout(4, lambda td: td.set("action", torch.full((3, 1), 5.0)))
+    expected = imagine(
+        drifting_model(9.0), lambda x: torch.full((3, 1), 5.0), reward, torch.zeros(3, 2), 4, LOW,
+        HIGH,
+    )  # fmt: skip
+    for key in ("observation", "action", ("next", "observation"), ("next", "reward")):
+        torch.testing.assert_close(found[key], expected[key])
+
+
+def test_a_reward_of_another_shape_is_named_by_the_environment() -> None:
+    env = EnsembleModelEnv(
+        drifting_model(9.0), lambda x, u, successor: u * x[..., 0], lambda n: torch.zeros(n, 2),
+        -1.0, 1.0, (2,),
+    )  # fmt: skip
+    with pytest.raises(ValueError, match=r"the reward function must return .* got \(2, 2\)"):
+        env.rollout(2)

@@ -133,6 +133,11 @@ def episodes(lengths: list[int], *, seed: int = 0) -> TensorDict:
     return torch.cat(parts)
 
 
+def known(observation, action):
+    """Value and Jacobian of what :func:`episodes` does, but for its noise."""
+    return 0.1 * action, torch.full((*action.shape, 1), 0.1)
+
+
 def test_stretches_lie_within_episodes_and_are_the_last_ones():
     data = episodes([250, 99, 30, 410])
     rows = stretches(data)
@@ -146,9 +151,6 @@ def test_stretches_lie_within_episodes_and_are_the_last_ones():
 
 
 def test_calibration_sets_what_the_controller_is_told():
-    def known(observation, action):
-        return 0.1 * action, torch.full((*action.shape, 1), 0.1)
-
     residuals = Residuals(1)
     residuals.measure(torch.tensor([[0.01], [-0.01]]))
     config = L1Config.robust(0.05, action_low=-1.0, action_high=1.0)
@@ -201,3 +203,41 @@ def test_a_table_in_double_precision_calibrates_a_model_in_single_precision():
         for rows in (data.float(), data.float().double())
     ]
     assert found[0] == found[1] is not None
+
+
+def test_calibration_is_of_the_covariance_that_the_controller_is_told_to_take():
+    def honest(observation, action, source):
+        assert source == "sum"
+        return torch.full((*observation.shape, 1), 1e-4)
+
+    residuals, data = Residuals(1), episodes([400] * 8)
+    residuals.measure(torch.tensor([[0.0025], [-0.0025]]))  # a quarter of the noise
+    measured, told = (
+        L1Config.robust(0.05, covariance=source, action_low=-1.0, action_high=1.0)
+        for source in ("residuals", "sum")
+    )
+    assert calibrate_filter(residuals, known, data, measured).inflation > 4
+    found = calibrate_filter(residuals, known, data, told, residual_covariance=honest)
+    assert found.inflation == residuals.inflation == 1
+    with pytest.raises(ValueError, match=r"residual_covariance=model\.residual_covariance"):
+        calibrate_filter(residuals, known, data, told)
+
+
+def test_calibration_measures_the_residuals_that_no_fit_has_measured():
+    residuals, data = Residuals(1), episodes([400] * 8)
+    config = L1Config.robust(0.05, action_low=-1.0, action_high=1.0)
+    found = calibrate_filter(residuals, known, data, config)
+    assert residuals.measured and residuals.calibrated
+    assert residuals.covariance.sqrt().item() == pytest.approx(0.01, rel=0.05)
+    assert found.inflation == 1
+
+
+def test_residuals_measured_anew_are_those_of_a_model_that_nobody_has_calibrated():
+    residuals, fresh = Residuals(1), Residuals(1)
+    data = torch.tensor([[0.01], [-0.01]])
+    fresh.measure(data)
+    residuals.inflation.fill_(8.0)
+    residuals.process_noise.fill_(0.001)
+    residuals.calibrated.fill_(True)
+    residuals.measure(data)
+    assert dict(residuals.named_buffers()) == dict(fresh.named_buffers())

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from torchrl_l1.objectives import LinearFeatureBaseline
@@ -27,3 +28,12 @@ def test_agrees_with_numpy_ridge_regression() -> None:
     gram = features.T @ features + 0.5 * np.eye(features.shape[1])
     expected = np.linalg.solve(gram, features.T @ target)[:, 0]
     np.testing.assert_allclose(baseline.coefficients.numpy(), expected, rtol=1e-8)
+
+
+def test_a_ridge_with_which_nothing_can_be_fitted_is_named() -> None:
+    for ridge in (-1.0, float("nan")):
+        with pytest.raises(ValueError, match=f"ridge must be finite and not negative, got {ridge}"):
+            LinearFeatureBaseline(2, ridge=ridge)
+    baseline = LinearFeatureBaseline(2, ridge=0.0)
+    with pytest.raises(ValueError, match=r"with ridge=0\.0: give a larger one"):
+        baseline.fit(torch.ones(10, 2), torch.arange(10)[:, None], torch.ones(10, 1))

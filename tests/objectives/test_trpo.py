@@ -188,7 +188,7 @@ def test_the_scale_of_the_advantages_does_not_matter(closed_form: bool) -> None:
     start = GaussianPolicy(3, 2, (4,), std=0.7).double()
     data = batch(make_actor(start.float())).double()
     steps = []
-    for scale in (1.0, 1e-8):
+    for scale in (1.0, 1e-8, 1e-180):
         policy, own = deepcopy(start).double(), data.clone()
         own["advantage"] *= scale
         if closed_form:
@@ -198,4 +198,19 @@ def test_the_scale_of_the_advantages_does_not_matter(closed_form: bool) -> None:
             report = trpo_step(make_actor(policy), own, TRPOConfig())
         assert report.accepted
         steps.append(parameters_to_vector(policy.parameters()))
-    torch.testing.assert_close(*steps, rtol=1e-6, atol=1e-8)
+    for step in steps[1:]:
+        torch.testing.assert_close(step, steps[0], rtol=1e-6, atol=1e-8)
+
+
+def test_a_parameter_that_the_distribution_does_not_use_stays_as_it_is() -> None:
+    torch.manual_seed(0)
+    alone, beside = GaussianPolicy(3, 2, (4,), std=0.7), GaussianPolicy(3, 2, (4,), std=0.7)
+    beside.load_state_dict(alone.state_dict())
+    beside.value = torch.nn.Linear(3, 1)
+    before = parameters_to_vector(beside.value.parameters()).clone()
+    data = batch(make_actor(alone))
+    assert trpo_step(make_actor(beside), data, TRPOConfig()).accepted
+    trpo_step(make_actor(alone), data, TRPOConfig())
+    for name, parameter in alone.named_parameters():
+        torch.testing.assert_close(parameter, beside.get_parameter(name))
+    assert torch.equal(parameters_to_vector(beside.value.parameters()), before)

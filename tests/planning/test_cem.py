@@ -236,6 +236,7 @@ def test_impossible_settings_are_named(wrong, message):
         ({"mean": torch.zeros(1, 3, 2)}, r"mean must have shape \(environments, 4, actions\)"),
         ({"mean": torch.zeros(4, 2)}, "mean must have shape"),
         ({"evaluate": lambda u: u[..., 0]}, r"evaluate returned shape \(1, 10, 4\)"),
+        ({"evaluate": lambda u: u.neg_().sum((2, 3))}, "evaluate function writes to"),
     ],
 )
 def test_impossible_problems_are_named(wrong, message):

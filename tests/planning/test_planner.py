@@ -292,6 +292,17 @@ def test_many_observations_are_planned_for_in_portions(monkeypatch):
     torch.testing.assert_close(plan.actions.sum((1, 2)), plan.best_return)
 
 
+def test_no_environments_get_no_actions():
+    data = make_controller()(fresh(make_controller(), (2, 0)))
+    assert data["action"].shape == (2, 0, 1) and data["next", "plan", "mean"].shape == (2, 0, 4, 1)
+
+
+def test_a_generator_of_another_device_is_named():
+    sampler = TrajectorySampler(make_controller().sampler.dynamics.to("meta"), upright)
+    with pytest.raises(ValueError, match=r"is on cpu, but .* on meta.*torch.Generator\('meta'\)"):
+        ModelPredictiveController(sampler, CONFIG, -1.0, 1.0, generator=torch.Generator())
+
+
 def test_plans_of_bad_observations():
     controller = make_controller()
     observation = torch.randn(3, 4)

@@ -361,6 +361,8 @@ def test_bad_input_is_named():
     check("compile must be True, False or 'auto', got 'yes'", compile="yes")
     check("the reward function must return", reward=lambda x, u, s: s[..., :1])
     check("the terminated function must return", terminated=lambda s: s[..., :1] > 0)
+    check("the reward function writes to", reward=lambda x, u, s: u.mul_(2)[..., 0])
+    check("the terminated function writes to", terminated=lambda s: s.abs_()[..., 0] > 1)
     for wrong, message in (
         ({"particles": 0}, "particles must be at least 1"),
         ({"propagation": "all"}, "propagation must be"),

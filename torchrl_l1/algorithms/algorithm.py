@@ -329,6 +329,7 @@ class Algorithm(ABC):
             self.learning.buffer[:],
             config,
             self.learning.action_key,
+            self.acting_dynamics.residual_covariance,
         )
         self.dynamics.residuals.load_state_dict(residuals.state_dict())
 

@@ -15,7 +15,7 @@ from torchrl_l1.compilation import CompileMode, compiled
 from torchrl_l1.control import kalman_law, law
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.jacobian import ActionJacobian
-from torchrl_l1.control.probe import FORWARD_MODE, probe_covariance, warn_of_calibration
+from torchrl_l1.control.probe import FORWARD_MODE, probe_covariance, warn_of_residuals
 from torchrl_l1.control.signals import (
     ControlInput,
     diagnose,
@@ -169,6 +169,9 @@ def augment(
     Returns:
         the executed input ``(..., m)``, the next state and the diagnostics.
 
+    Raises:
+        ValueError: if a setting or a shape does not fit the state's.
+
     Examples:
         >>> from torchrl_l1.control import init
         >>> model = ActionJacobian(lambda x, u: -0.1 * x + 0.2 * u.sin())
@@ -192,6 +195,7 @@ def augment_silently(
     u_rl: Tensor,
 ) -> tuple[Tensor, L1State, Callable[[], L1Diagnostics]]:
     """:func:`augment` with the diagnostics as a function, which need not be called."""
+    config.check_dimensions(state.x_hat.shape[-1], state.q.shape[-1])
     if config.filter == "kalman":
         return _augment_kalman(config, model, state, observation, u_rl)
     u_rl = saturate(config, u_rl)
@@ -309,13 +313,12 @@ def make_step(
         return *augment_silently(config, model, state, observation, u_rl)[:2], None
 
     known = ("residual_statistics", "residual_covariance")
-    if config.estimator == "weighted" and not any(
-        callable(getattr(model.dynamics, name, None)) for name in known
-    ):
+    if _weighs(config) and not any(callable(getattr(model.dynamics, name, None)) for name in known):
+        setting = "estimator='weighted'" if config.estimator == "weighted" else "filter='kalman'"
         warnings.warn(
-            f"estimator='weighted' knows no covariance of {type(model.dynamics).__name__}'s "
-            "residuals and takes the identity: give the model a residual_covariance(observation, "
-            "action), or fit an EnsembleDynamics, which measures its own",
+            f"{setting} knows no covariance of {type(model.dynamics).__name__}'s residuals and "
+            "takes the identity: give the model a residual_covariance(observation, action), or fit "
+            "an EnsembleDynamics, which measures its own",
             stacklevel=3,
         )
 
@@ -323,35 +326,42 @@ def make_step(
     # cannot make dual tensors of them, which forward-mode Jacobians need.
     whole = compiled(cast(FunctionType, step), mode, dynamic=False)
     whole = partial(_in_blocks, whole) if model.blockwise else whole
-    return partial(_prepared, whole, config, model)
+    return _prepared(whole, config, model)
 
 
-def _prepared(
-    step: StepFunction,
-    config: L1Config,
-    model: ActionJacobian,
-    state: L1State,
-    observation: Tensor,
-    u_rl: Tensor,
-) -> Step:
-    """The step of a model that has been looked at: at the first one it is."""
-    nothing_to_see = observation.shape[:-1].numel() == 0
-    if model.ready or nothing_to_see or torch.compiler.is_compiling():
-        return step(state, observation, u_rl)
-    with FORWARD_MODE:  # where the step is compiled, torch differentiates while it traces
-        model.prepare(observation, saturate(config, u_rl))
-        if config.filter == "kalman" or config.estimator == "weighted":
-            probe_covariance(
-                model.dynamics,
-                lambda x, u: model.residual_statistics(x, u, config.covariance).covariance,
-                observation,
-                saturate(config, u_rl),
-                is_whole=config.estimator == "weighted",
-                is_late=config.filter == "kalman" and config.covariance == "residuals",
-            )
-        if config.filter == "kalman" and config.inflation is None:
-            warn_of_calibration(model.dynamics)
-        return step(state, observation, u_rl)
+def _weighs(config: L1Config) -> bool:
+    """Whether the covariance of the model's residuals matters."""
+    return config.filter == "kalman" or config.estimator == "weighted"
+
+
+def _prepared(step: StepFunction, config: L1Config, model: ActionJacobian) -> StepFunction:
+    """The step of a model that is looked at before the first one, and after ``train()``."""
+    # Another controller may have looked at the model, but not at what this one asks of it.
+    is_checked = False
+
+    def prepared(state: L1State, observation: Tensor, u_rl: Tensor) -> Step:
+        nonlocal is_checked
+        nothing_to_see = observation.shape[:-1].numel() == 0
+        if (is_checked and model.ready) or nothing_to_see or torch.compiler.is_compiling():
+            return step(state, observation, u_rl)
+        with FORWARD_MODE:  # where the step is compiled, torch differentiates while it traces
+            action = saturate(config, u_rl)
+            model.prepare(observation, action)
+            if _weighs(config):
+                probe_covariance(
+                    model.dynamics,
+                    lambda x, u: model.residual_statistics(x, u, config.covariance).covariance,
+                    observation,
+                    action,
+                    is_whole=config.estimator == "weighted",
+                    is_late=config.filter == "kalman" and config.covariance == "residuals",
+                )
+                has_inflation = config.filter != "kalman" or config.inflation is not None
+                warn_of_residuals(model.dynamics, is_calibrated=has_inflation)
+            is_checked = True
+            return step(state, observation, u_rl)
+
+    return prepared
 
 
 def _in_blocks(step: StepFunction, state: L1State, observation: Tensor, u_rl: Tensor) -> Step:

@@ -72,7 +72,7 @@ def calibrate(
         residual: what the model missed in each step of undisturbed episodes ``(S, T, n)``, state
             units.
         jacobian: of the model in the same steps ``(S, T, n, m)``.
-        covariance: of the residuals ``(n, n)``.
+        covariance: of the residuals ``(n, n)``, or of each of them ``(S, T, n, n)``.
         action: that was executed in the same steps ``(S, T, m)``; zero if ``None``.
         inflations: those tried.
         process_noises: those tried.
@@ -117,10 +117,12 @@ def calibrate(
         )
     covariance = covariance.to(residual)
     is_whole = config.estimator == "weighted"
-    if covariance.shape != (n, n) or not is_positive(covariance, is_whole):
+    shapes = (n, n), (sequences, steps, n, n)
+    if covariance.shape not in shapes or not is_positive(covariance, is_whole):
         raise ValueError(
-            f"calibration needs a positive definite covariance of the shape {(n, n)}, got "
-            f"{tuple(covariance.shape)}: give states without residuals a small variance"
+            f"calibration needs a positive definite covariance of the shape {shapes[0]} or "
+            f"{shapes[1]}, got {tuple(covariance.shape)}: give states without residuals a small "
+            "variance"
         )
     if generator is None:
         generator = torch.Generator().manual_seed(0)
@@ -130,19 +132,21 @@ def calibrate(
     disturbance = torch.cat([torch.zeros_like(disturbance), disturbance])
     residual, action = residual.repeat(2, 1, 1), action.repeat(2, 1, 1)
     jacobian = jacobian.repeat(2, 1, 1, 1)
+    covariance = covariance if covariance.ndim == 2 else covariance.repeat(2, 1, 1, 1)
     passed = saturate(config, action + disturbance) - action
     residual = residual + (jacobian @ passed.unsqueeze(-1)).squeeze(-1)
 
     tried = [
         {"process_noise": noise, "inflation": inflation}
         for noise in process_noises
-        for inflation in inflations
+        for inflation in sorted(inflations)
     ]
     # All pairs side by side: a leading dimension.
     noise, inflation = residual.new_tensor([list(pair.values()) for pair in tried]).T
     statistics = ResidualStatistics(
         covariance, inflation[:, None, None, None], noise[:, None, None]
     )
+    # The covariance is at hand, wherever it comes from: none needs to be remembered.
     free = replace(config, process_noise=None, inflation=None, covariance="residuals")
     mean, variance = replay(free, residual, jacobian, action, statistics, len(tried))
     posterior = kalman.Posterior(mean, torch.diag_embed(variance))
@@ -191,7 +195,7 @@ def replay(
         jacobian: ``(S, T, n, m)``.
         action: that was executed ``(S, T, m)``.
         statistics: of the residuals; what there is one of per candidate has as many leading
-            entries.
+            entries. The covariance is ``(n, n)``, or of each step ``(S, T, n, n)``.
         candidates: C.
 
     Returns:
@@ -202,12 +206,18 @@ def replay(
         [candidates, sequences], n, m, config, dtype=residual.dtype, device=residual.device
     )
     zero = torch.zeros_like(state.x_hat)
+
+    def known(t: int) -> ResidualStatistics:
+        if statistics.covariance.ndim == 2:
+            return statistics
+        return statistics._replace(covariance=statistics.covariance[:, t])
+
     # The first step starts the filter, and knows nothing yet.
-    estimated = kalman_law.estimate(config, state, zero, statistics)
+    estimated = kalman_law.estimate(config, state, zero, known(0))
     means, variances = [], []
     for t in range(steps):
         state = _before(config, state, estimated, jacobian[:, t], action[:, t])
-        estimated = kalman_law.estimate(config, state, residual[:, t].expand_as(zero), statistics)
+        estimated = kalman_law.estimate(config, state, residual[:, t].expand_as(zero), known(t))
         means.append(estimated.posterior.mean)
         variances.append(estimated.posterior.covariance.diagonal(dim1=-2, dim2=-1))
     return torch.stack(means, -2), torch.stack(variances, -2)

@@ -182,6 +182,11 @@ class L1Config:
         if not 0 < self.forgetting <= 1:
             raise ValueError(f"forgetting must lie in (0, 1], got {self.forgetting}")
         if self.filter != "kalman":
+            if self.process_noise is not None or self.inflation is not None:
+                raise ValueError(
+                    "process_noise and inflation belong to the Kalman filter: leave them out with "
+                    "filter='low_pass'"
+                )
             return
         if self.cutoff is not None or self.alpha is not None:
             raise ValueError(
@@ -203,6 +208,9 @@ class L1Config:
                 )
 
     def _check_bounds(self) -> None:
+        for name, bound in (("action_low", math.inf), ("action_high", -math.inf)):
+            if bound in _tuple(getattr(self, name) or 0.0):
+                raise ValueError(f"{name} must not be {bound}: no action is within such a bound")
         if self.action_low is None or self.action_high is None:
             return
         low, high = _tuple(self.action_low), _tuple(self.action_high)

@@ -188,13 +188,7 @@ class ActionJacobian:
             modes: dict[Mode, Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]]
             if self.analytic:
                 modes = {"analytic": self._analytically}
-                mode = probe(
-                    self.dynamics,
-                    lambda x, u: self._analytically(x, u)[0],
-                    modes,
-                    observation,
-                    action,
-                )
+                mode = probe(self.dynamics, self._first_analytic_value, modes, observation, action)
             else:
                 self._lift(observation, action)
                 modes = {"forward": self._forward_mode, "reverse": self._reverse_mode}
@@ -231,6 +225,12 @@ class ActionJacobian:
         except Exception as error:  # of a model that is made for something else, anything
             raise failure(self.dynamics, observation, action, error) from error
         return self._change(prediction, observation, action)
+
+    def _first_analytic_value(self, observation: Tensor, action: Tensor) -> Tensor:
+        try:
+            return self._analytically(observation, action)[0]
+        except RuntimeError as error:  # torch's, as of a model of another type
+            raise failure(self.dynamics, observation, action, error) from error
 
     def _change(self, prediction: Tensor, observation: Tensor, action: Tensor) -> Tensor:
         self._check_type(prediction, observation)

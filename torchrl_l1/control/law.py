@@ -109,7 +109,7 @@ def step(
         switching law, which this function does not evaluate, hold ``restart`` and zeros).
 
     Raises:
-        ValueError: if a shape does not fit the state's.
+        ValueError: if a setting or a shape does not fit the state's.
 
     Examples:
         >>> from torchrl_l1.control import init
@@ -122,6 +122,7 @@ def step(
         >>> state.x_hat[0]
         tensor([0.5000, 0.5000, 0.5000])
     """
+    config.check_dimensions(state.x_hat.shape[-1], state.q.shape[-1])
     u_rl = saturate(config, u_rl)
     _check_shapes(state, observation, u_rl, drift, "drift", jacobian, restart)
     if config.filter == "kalman":

@@ -145,9 +145,25 @@ def probe_covariance(
                 )
 
 
-def warn_of_calibration(dynamics: object) -> None:
-    """Say so where a model does not know how far the residuals that it measures can be trusted."""
-    calibrated = getattr(getattr(dynamics, "residuals", None), "calibrated", None)
+def warn_of_residuals(dynamics: object, *, is_calibrated: bool) -> None:
+    """Say so where a model does not know its residuals, or how far they can be trusted.
+
+    Args:
+        dynamics: the model, to be named in warnings.
+        is_calibrated: whether the latter is given, or does not matter.
+    """
+    residuals = getattr(dynamics, "residuals", None)
+    if is_calibrated:
+        measured = getattr(residuals, "measured", None)
+        if isinstance(measured, Tensor) and not bool(measured):
+            warnings.warn(
+                f"nothing has measured the residuals of {describe(dynamics)}, whose covariance is "
+                "taken for the identity: fit_ensemble does, and model.residuals.measure() takes "
+                "those of a training of your own",
+                stacklevel=2,
+            )
+        return
+    calibrated = getattr(residuals, "calibrated", None)
     if isinstance(calibrated, Tensor) and not bool(calibrated):
         warnings.warn(
             f"the Kalman filter takes the residuals of {describe(dynamics)} for white noise, since "

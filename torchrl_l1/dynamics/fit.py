@@ -241,7 +241,7 @@ def fit_dynamics(
     n, m = (transitions.data[key].shape[-1] for key in ("observation", "action"))
     entry_names(n, names, units)
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(seed))
+        torch.default_generator.manual_seed(int(seed))  # all draws are the CPU's
         dynamics = make_dynamics(n, m, **{"hidden": (128, 128), **settings}).to(here)
         transitions.warn_of_gaps(*keys, std_floor=dynamics.change_normalizer.std_floor)
         optimizer = torch.optim.Adam(dynamics.parameters(), lr=config.learning_rate)

@@ -66,8 +66,8 @@ def imagine(
         step that is ``done`` is not valid and means nothing; its rewards are zero.
 
     Raises:
-        ValueError: for no steps, start states of another shape, or a reward or termination that is
-            not one number per row.
+        ValueError: for no steps, start states of another shape, a reward or termination that is
+            not one number per row, or a function that writes to what it is given.
     """
     n, m = dynamics.observation_dim, dynamics.action_dim
     check_count("horizon", horizon)
@@ -86,7 +86,7 @@ def imagine(
     holds = bool(box.fixed.any())
     observations[0] = observation = start
     for t, member in enumerate(drawn):
-        actions[t] = policy(observation)
+        actions[t] = untouched(policy, "policy", observation)
         inputs[:, :n] = observation
         inputs[:, n:] = actions[t].clamp(action_low, action_high)
         change = passes[member](inputs)[:, :n]
@@ -106,15 +106,17 @@ def imagine(
         observations = observations.gather(0, place.expand(-1, -1, n))
         actions = actions.gather(0, place[:-1].expand(-1, -1, m))
     successors = observations[1:].flatten(0, 1)
-    rewards = reward(
+    rewards = one_each(
+        reward,
+        "reward",
         observations[:-1].flatten(0, 1),
         actions.flatten(0, 1).clamp(action_low, action_high),
         successors,
     )
-    rewards = one_each(rewards, successors, "reward").to(start.dtype).unflatten(0, (horizon, batch))
+    rewards = rewards.to(start.dtype).unflatten(0, (horizon, batch))
     fallen = torch.zeros_like(inside)
     if terminated is not None:
-        fallen = one_each(terminated(successors), successors, "terminated").bool()
+        fallen = one_each(terminated, "terminated", successors).bool()
         fallen = fallen.unflatten(0, (horizon, batch))
     ended = (~inside | fallen).long()
     valid = (ended.cumsum(0) - ended) == 0
@@ -139,19 +141,41 @@ def imagine(
     return TensorDict(columns, batch_size=[horizon, batch]).transpose(0, 1)
 
 
-def one_each(values: Tensor, rows: Tensor, name: str) -> Tensor:
-    """What a reward or a termination gives, which must be ``(...)`` for rows ``(..., n)``.
+def one_each(function: Callable[..., Tensor], name: str, *inputs: Tensor) -> Tensor:
+    """What a reward or a termination gives, which must be ``(...)`` for inputs ``(..., width)``.
 
     Raises:
-        ValueError: naming the function.
+        ValueError: naming the function, also where it writes to its inputs.
     """
+    values, batch = untouched(function, name, *inputs), tuple(inputs[0].shape[:-1])
     found = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
-    if found != tuple(rows.shape[:-1]):
+    if found != batch:
         raise ValueError(
             f"the {name} function must return shape (...) for inputs of shape (..., width), got "
-            f"{found} for inputs of shape {tuple(rows.shape[:-1])} + (width,)"
+            f"{found} for inputs of shape {batch} + (width,)"
         )
     return values
+
+
+def untouched(function: Callable[..., Tensor], name: str, *inputs: Tensor) -> Tensor:
+    """What a function gives that may read its inputs only, which others go on to use.
+
+    Raises:
+        ValueError: naming the function, where it writes to one of them.
+    """
+    before = _writes(inputs)
+    values = function(*inputs)
+    if _writes(inputs) != before:
+        raise ValueError(
+            f"the {name} function writes to what it is given in place, which is used afterwards: "
+            "let it work on a copy"
+        )
+    return values
+
+
+def _writes(tensors: Sequence[Tensor]) -> list[int]:
+    """How often each has been written to; those of inference mode do not count."""
+    return [0 if tensor.is_inference() else tensor._version for tensor in tensors]
 
 
 def _forward_pass(
@@ -205,10 +229,11 @@ class EnsembleWorldModel(TensorDictModuleBase):
         left = ~self.dynamics.box.contains(successor).unsqueeze(-1)
         # Outside, neither state nor reward mean anything.
         successor = torch.where(left, observation, successor)
+        reward = one_each(self.reward, "reward", observation, action, successor)
         return tensordict.update(
             {
                 "observation": successor,
-                "reward": self.reward(observation, action, successor).to(change).unsqueeze(-1),
+                "reward": reward.to(change).unsqueeze(-1),
                 "terminated": left,
                 "done": left,
             }
@@ -219,8 +244,8 @@ class EnsembleModelEnv(ModelBasedEnvBase):
     """A learned ensemble as an environment for TorchRL's rollouts, collectors and planners.
 
     It terminates where the state leaves the box around the model's data, in the last one inside,
-    which the reward of that step is of. For the inner loop of
-    an algorithm :func:`~torchrl_l1.dynamics.imagine` does the same faster.
+    which the reward of that step is of. Model and reward see the action within its bounds. For the
+    inner loop of an algorithm :func:`~torchrl_l1.dynamics.imagine` does the same faster.
 
     Args:
         dynamics: the ensemble.
@@ -274,6 +299,11 @@ class EnsembleModelEnv(ModelBasedEnvBase):
         )
         self.action_spec = Bounded(low, high, (*batch_size, m), **kind)
         self.reward_spec = Unbounded((*batch_size, 1), **kind)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        space = self.action_spec.space
+        clipped = tensordict["action"].clamp(space.low, space.high)
+        return super()._step(tensordict.copy().set("action", clipped))
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: object) -> TensorDict:
         shape = self.batch_size if tensordict is None else tensordict.shape

@@ -14,6 +14,8 @@ from torchrl_l1.control import Calibration, L1Config, calibrate
 SEQUENCES, STEPS = 32, 100
 """How much of undisturbed episodes a calibration replays: so many stretches of so many steps."""
 
+_INFLATION, _PROCESS_NOISE = 1.0, 0.01  # of a model that nobody has calibrated
+
 
 class Residuals(nn.Module):
     """Statistics of the one-step residuals of a model on data that it was not trained on.
@@ -41,8 +43,8 @@ class Residuals(nn.Module):
         super().__init__()
         self.register_buffer("covariance", torch.eye(dim))
         self.register_buffer("measured", torch.tensor(False))
-        self.register_buffer("inflation", torch.tensor(1.0))
-        self.register_buffer("process_noise", torch.tensor(0.01))
+        self.register_buffer("inflation", torch.tensor(_INFLATION))
+        self.register_buffer("process_noise", torch.tensor(_PROCESS_NOISE))
         self.register_buffer("calibrated", torch.tensor(False))
 
     @torch.no_grad()
@@ -61,7 +63,9 @@ class Residuals(nn.Module):
             raise ValueError("residuals have entries that are not finite: leave them out first")
         self.covariance.copy_(shrunk_covariance(residual))
         self.measured.fill_(True)
-        # It was of another model.
+        # What was calibrated was of another model.
+        self.inflation.fill_(_INFLATION)
+        self.process_noise.fill_(_PROCESS_NOISE)
         self.calibrated.fill_(False)
 
     def _load_from_state_dict(
@@ -118,21 +122,33 @@ def calibrate_filter(
     data: TensorDictBase,
     config: L1Config,
     action_key: str = "action",
+    residual_covariance: Callable[[Tensor, Tensor, str], Tensor] | None = None,
 ) -> Calibration | None:
     """Find the inflation and the process noise that suit a model and what it has seen.
 
     Args:
-        residuals: the model's, changed in place.
+        residuals: the model's, changed in place; their covariance is measured on the same data
+            where no fit has measured it.
         value_and_jacobian: the model's, see :class:`~torchrl_l1.control.ActionJacobian`.
         data: transitions ``[N]`` in the order in which they were collected, without
             disturbances that the controller is to cancel; the last of them count.
         config: the controller's settings, with the bounds of the action.
         action_key: of the action that the model was fitted to.
+        residual_covariance: the model's, needed where the settings take the ``covariance`` from
+            elsewhere than its ``"residuals"``.
 
     Returns:
         what :func:`~torchrl_l1.control.calibrate` found; ``None``, and no change, where no
         episode has 20 steps in a row.
+
+    Raises:
+        ValueError: without a ``residual_covariance`` that is needed.
     """
+    if config.covariance != "residuals" and residual_covariance is None:
+        raise ValueError(
+            f"covariance={config.covariance!r} is not that of the measured residuals: give "
+            "calibrate_filter residual_covariance=model.residual_covariance"
+        )
     rows = stretches(data)
     if rows is None:
         return None
@@ -147,9 +163,13 @@ def calibrate_filter(
     whole = torch.stack([part.isfinite().flatten(1).all(1) for part in parts]).all(0)
     if not whole.any():
         return None
-    found = calibrate(
-        config, residual[whole], jacobian[whole], residuals.covariance, action=action[whole]
-    )
+    residual, jacobian, action = residual[whole], jacobian[whole], action[whole]
+    if not residuals.measured:
+        residuals.measure(residual.flatten(0, 1))
+    covariance = residuals.covariance
+    if config.covariance != "residuals" and residual_covariance is not None:
+        covariance = residual_covariance(observation[whole], action, config.covariance)
+    found = calibrate(config, residual, jacobian, covariance, action=action)
     residuals.inflation.fill_(found.inflation)
     residuals.process_noise.fill_(found.process_noise)
     residuals.calibrated.fill_(True)

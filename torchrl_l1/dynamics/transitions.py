@@ -140,7 +140,7 @@ def read_transitions(
         action_key: of the action ``(..., m)``.
         validation_fraction: share of rows kept out of training, in (0, 1).
         seed: of the draw.
-        dtype: of the result; that of the data if ``None``.
+        dtype: of the result; torch's default if ``None``.
         device: of the result; that of the data if ``None``.
 
     Raises:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from torchrl_l1.checks import check_not_negative
+
 
 class LinearFeatureBaseline(nn.Module):
     """Value estimate, linear in ``[o, o^2, t/100, (t/100)^2, (t/100)^3, 1]`` (o clipped to +-10).
@@ -16,12 +18,17 @@ class LinearFeatureBaseline(nn.Module):
     Args:
         observation_dim: number of observations, n.
         ridge: regularisation of the least squares problem.
+
+    Raises:
+        ValueError: for a negative ``ridge``; at a fit without one, if the data do not determine the
+            coefficients.
     """
 
     coefficients: Tensor
 
     def __init__(self, observation_dim: int, ridge: float = 1e-5) -> None:
         super().__init__()
+        check_not_negative("ridge", ridge)
         self.ridge = ridge
         self.register_buffer("coefficients", torch.zeros(2 * observation_dim + 4))
 
@@ -43,4 +50,10 @@ class LinearFeatureBaseline(nn.Module):
         gram = features.T @ features
         gram.diagonal().add_(self.ridge)
         moment = features.T @ target.reshape(-1, 1).double()
-        self.coefficients.copy_(torch.linalg.solve(gram, moment).squeeze(-1))
+        try:
+            solution = torch.linalg.solve(gram, moment)
+        except torch.linalg.LinAlgError as error:
+            raise ValueError(
+                f"the data do not determine the baseline with ridge={self.ridge}: give a larger one"
+            ) from error
+        self.coefficients.copy_(solution.squeeze(-1))

@@ -156,7 +156,10 @@ def take_step(problem: TrustRegionProblem, advantage: Tensor, config: TRPOConfig
 
     parameters = problem.parameters
     gradient = problem.gradient()
-    direction = conjugate_gradient(product, gradient, config.cg_iterations)
+    # The step is as long whatever the gradient's length, but squares of a tiny one would be lost.
+    largest = gradient.abs().max()
+    unit = gradient / largest if 0 < largest < 1e-5 else gradient
+    direction = conjugate_gradient(product, unit, config.cg_iterations)
     curvature = direction @ product(direction)
     if not torch.isfinite(curvature):
         return TRPOReport(improvement=0.0, kl=math.nan, accepted=False, backtracks=0)
@@ -224,7 +227,11 @@ class _AutogradProblem:
                 divergence, self.parameters, create_graph=True
             )
         products = torch.autograd.grad(
-            self._divergence_gradient @ vector, self.parameters, retain_graph=True
+            self._divergence_gradient @ vector,
+            self.parameters,
+            retain_graph=True,
+            allow_unused=True,
+            materialize_grads=True,
         )
         return torch.cat([part.reshape(-1) for part in products])
 
@@ -243,5 +250,8 @@ def fisher_stride(config: TRPOConfig) -> int:
 
 
 def _flat_gradient(scalar: Tensor, parameters: list[Tensor], create_graph: bool = False) -> Tensor:
-    gradients = torch.autograd.grad(scalar, parameters, create_graph=create_graph)
+    # The distribution need not depend on all, as on the head of a value beside it.
+    gradients = torch.autograd.grad(
+        scalar, parameters, create_graph=create_graph, allow_unused=True, materialize_grads=True
+    )
     return torch.cat([gradient.reshape(-1) for gradient in gradients])

@@ -158,12 +158,12 @@ def imagined_returns(
         torch.addcmul(states[t], change, network.change_std, out=states[t + 1])
         states[t + 1] += network.change_mean
     # Rewards may be integers or booleans: discounts and means are not.
-    rewards = one_each(reward(states[:-1], u, states[1:]), u, "reward").to(u.dtype)
+    rewards = one_each(reward, "reward", states[:-1], u, states[1:]).to(u.dtype)
     if terminated is None:
         # A state that is not finite stays so: the last tells for all.
         sound = torch.isfinite(states[-1]).all(-1)
     else:
-        ended = one_each(terminated(states[1:]), u, "terminated").bool().long()
+        ended = one_each(terminated, "terminated", states[1:]).bool().long()
         over = (ended.cumsum(0) - ended) > 0
         rewards = torch.where(over, 0.0, rewards)
         sound = (torch.isfinite(states[1:]).all(-1) | over).all(0)

@@ -64,8 +64,8 @@ class ModelPredictiveController(TensorDictModuleBase):
 
     Raises:
         ValueError: for bounds that are empty or of the wrong width, ``replan_every`` outside the
-            horizon; at a call, for an observation or state of the wrong shape, and for a reward
-            that is not finite where the system is.
+            horizon, a generator on another device than the model; at a call, for an observation or
+            state of the wrong shape, and for a reward that is not finite where the system is.
         KeyError: at a call, if the observation or the planner's state is missing.
         TypeError: for another kind of settings.
 
@@ -104,6 +104,12 @@ class ModelPredictiveController(TensorDictModuleBase):
             raise ValueError(
                 f"replan_every must be between 1 and the horizon {config.horizon}, got "
                 f"{replan_every}"
+            )
+        device = sampler.dynamics.device
+        if generator is not None and generator.device.type != device.type:
+            raise ValueError(
+                f"the generator is on {generator.device}, but plans are made on {device}, where "
+                f"the model is: give torch.Generator({str(device)!r})"
             )
         self.sampler = sampler
         self.config = config
@@ -189,8 +195,9 @@ class ModelPredictiveController(TensorDictModuleBase):
         batch = tensordict.batch_size
         observation = self._observation(tensordict)
         count = batch.numel()
-        device = self.sampler.dynamics.device
-        flat = observation.reshape(count, -1).to(device)
+        dynamics = self.sampler.dynamics
+        device = dynamics.device
+        flat = observation.reshape(count, dynamics.observation_dim).to(device)
         mean, step, best_return = (
             self._state(tensordict, name).to(device).reshape(count, *shape)
             for name, (shape, _) in self._spec.items()
@@ -211,7 +218,8 @@ class ModelPredictiveController(TensorDictModuleBase):
             "step": (step + 1)[:, None],
             "best_return": best_return,
         }
-        tensordict.set(self.action_key, sequence[:, 0].reshape(*batch, -1).to(observation.device))
+        action = sequence[:, 0].reshape(*batch, dynamics.action_dim)
+        tensordict.set(self.action_key, action.to(observation.device))
         tensordict.set(
             ("next", self.key),
             TensorDict(

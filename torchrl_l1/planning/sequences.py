@@ -9,6 +9,8 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from torchrl_l1.dynamics.imagination import untouched
+
 Evaluate = Callable[[Tensor], Tensor]
 """Returns ``(N, C)`` of candidate action sequences ``(N, C, H, m)``."""
 
@@ -94,9 +96,9 @@ def evaluated(evaluate: Evaluate, sequences: Tensor) -> Tensor:
     """Returns of the sequences ``(N, C)``, minus infinity for all that are not finite.
 
     Raises:
-        ValueError: if ``evaluate`` returns another shape.
+        ValueError: if ``evaluate`` returns another shape, or writes to the sequences.
     """
-    returns = evaluate(sequences)
+    returns = untouched(evaluate, "evaluate", sequences)
     if returns.shape != sequences.shape[:2]:
         raise ValueError(
             f"evaluate returned shape {tuple(returns.shape)} for candidates of shape "

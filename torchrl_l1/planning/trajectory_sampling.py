@@ -96,7 +96,8 @@ def evaluate(
 
     Raises:
         ValueError: for shapes that do not fit the model, unknown propagation, a discount outside
-            (0, 1], ``"ts1"`` compiled, or a reward or termination of the wrong shape.
+            (0, 1], ``"ts1"`` compiled, or a reward or termination of the wrong shape, or one that
+            writes to what it is given.
 
     Examples:
         >>> model = EnsembleDynamics(3, 1, members=5, hidden=(8,))
