@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, LazyTensorStorage, ReplayBuffer, Unbounded
 from torchrl.envs import (
     Compose,
     ConditionalSkip,
@@ -25,6 +25,7 @@ from torchrl.envs import (
     SerialEnv,
     Transform,
     TransformedEnv,
+    UnsqueezeTransform,
 )
 from torchrl.envs.utils import check_env_specs
 
@@ -41,6 +42,7 @@ from torchrl_l1.envs import (
     RandomSigns,
     SensorBias,
     SensorDelay,
+    SensorDropout,
     SineBias,
     StepBias,
     Stiction,
@@ -81,6 +83,16 @@ def send(env: EnvBase, action: Tensor) -> Tensor:
 def restart(env: EnvBase, rows: list[bool]) -> None:
     mask = torch.tensor(rows).unsqueeze(-1)
     env.reset(TensorDict({"_reset": mask}, batch_size=env.batch_size))
+
+
+class EchoOfAgents(Echo):
+    """Its only ``done`` is that of two agents."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        done = Binary(shape=(3, 2, 1), dtype=torch.bool)
+        agent = Composite(done=done, terminated=done.clone(), shape=[3])
+        self.full_done_spec = Composite(agent=agent, shape=[3])
 
 
 MATCHED = [
@@ -366,6 +378,65 @@ def test_a_step_that_is_skipped_changes_no_state(rows):
         expected = [0.2 if row else 0.1 for row in rows]
         assert received[2].tolist() == pytest.approx(expected)
         assert received[3].tolist() == pytest.approx([0.3, 0.3])
+
+
+def test_the_mask_of_a_reset_may_be_nested():
+    env = TransformedEnv(EchoOfAgents(), StepBias(0.5, at=2))
+    env.reset()
+    zero = torch.zeros(3, 2, dtype=torch.float64)
+    for _ in range(2):
+        assert not send(env, zero).any()
+    mask = torch.tensor([[False, False], [False, True], [False, False]]).unsqueeze(-1)
+    state = env.full_done_spec.zero().set(("agent", "_reset"), mask)
+    env.reset(state)
+    assert send(env, zero)[:, 0].tolist() == [0.5, 0.0, 0.5]
+
+
+def pendulums(*transforms: Transform) -> tuple[TransformedEnv, TensorDict]:
+    """Two of TorchRL's own pendulums, which are not batch-locked, and their first state."""
+    vector = UnsqueezeTransform(-1, in_keys=["th"], out_keys=["observation"])
+    env = TransformedEnv(PendulumEnv(), Compose(vector, *transforms))
+    return env, env.reset(env.base_env.gen_params(batch_size=[2]), set_state=True)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: SineBias(0.5),
+        lambda: StepBias(0.5, at=1),
+        lambda: ActuatorDelay(1),
+        lambda: SensorDelay(1),
+        lambda: SensorDropout(0.5),
+    ],
+)
+def test_steps_left_out_where_the_batch_is_not_locked_are_refused(make):
+    skip = ConditionalSkip(lambda data: torch.tensor([True, False]))
+    env, state = pendulums(skip, transform := make())
+    with pytest.raises(ValueError, match=rf"{type(transform).__name__} .*steps cannot be left out"):
+        env.rollout(3, auto_reset=False, tensordict=state)
+    env, state = pendulums(make())
+    env.step(env.rand_action(state))
+    with pytest.raises(ValueError, match=r"batch \(2,\), but \(1,\) steps.* not batch-locked"):
+        env.step(env.rand_action(state[:1]))
+    # Another number of environments may begin.
+    three = env.reset(env.base_env.gen_params(batch_size=[3]), set_state=True)
+    env.rollout(3, auto_reset=False, tensordict=three)
+
+
+@pytest.mark.parametrize("make", [lambda: ActuatorBias(0.5), lambda: ActionNoise(0.5)])
+def test_stored_data_are_refused(make):
+    data = TensorDict({"action": torch.zeros(2, 1)}, batch_size=[2])
+    buffer = ReplayBuffer(storage=LazyTensorStorage(4), transform=make())
+    with pytest.raises(RuntimeError, match=r"belongs to an environment .*not to a replay buffer"):
+        buffer.extend(data)
+
+
+def test_weights_of_another_environment_do_not_change_the_disturbance():
+    env = TransformedEnv(Echo(), ActuatorBias(0.5))
+    env.load_state_dict(TransformedEnv(Echo(), ActuatorBias(0.25)).state_dict())
+    env.reset()
+    zero = torch.zeros(3, 2, dtype=torch.float64)
+    assert send(env, zero).unique().tolist() == [0.5]
 
 
 def test_frames_around_a_disturbance_are_disturbed_once_each():
