@@ -7,6 +7,8 @@ from typing import Any
 import gymnasium
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import (
     Compose,
     EnvBase,
@@ -52,6 +54,26 @@ def gymnasium_normalised(frozen: bool) -> GymWrapper:
     return GymWrapper(env)
 
 
+class Agents(EnvBase):
+    """Two agents, each with a ``done`` of its own."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_spec = Composite(observation=Unbounded((3,)))
+        self.action_spec = Composite(action=Bounded(-1, 1, (1,)))
+        done = Binary(shape=(2, 1), dtype=torch.bool)
+        self.full_done_spec = Composite(agent=Composite(done=done, terminated=done.clone()))
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+    def _reset(self, tensordict: Any = None, **kwargs: Any) -> TensorDict:
+        return self.full_observation_spec.zero().update(self.full_done_spec.zero())
+
+    def _step(self, tensordict: TensorDict) -> TensorDict:
+        return self._reset().update(self.full_reward_spec.zero())
+
+
 def with_face(face: str, env: EnvBase, **settings: Any) -> EnvBase:
     if face == "transform":
         return TransformedEnv(env, L1Transform(model, **settings), auto_unwrap=False)
@@ -82,6 +104,14 @@ def test_statistics_that_change_in_each_environment_are_noticed():
     base = SerialEnv(2, partial(gymnasium_normalised, False))
     with pytest.warns(UserWarning, match="NormalizeObservation stands between"):
         TransformedEnv(base, L1Transform(model, dt=0.05)).reset()
+
+
+@pytest.mark.parametrize("face", FACES)
+def test_resets_without_a_mask_at_the_root_are_refused(face):
+    with pytest.raises(
+        ValueError, match=r"L1\w+ starts afresh .* resets by \[\('agent', '_reset'\)"
+    ):
+        with_face(face, Agents(), dt=0.05).reset()
 
 
 def test_statistics_that_change_elsewhere_do_not_matter():

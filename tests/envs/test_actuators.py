@@ -22,6 +22,7 @@ from torchrl.envs import (
     MultiAction,
     NoopResetEnv,
     PendulumEnv,
+    RenameTransform,
     SerialEnv,
     Transform,
     TransformedEnv,
@@ -360,6 +361,18 @@ def test_a_controller_inside_is_refused(make, auto_unwrap):
     many = SerialEnv(2, lambda: TransformedEnv(Echo((1,)), OracleTransform()))
     with pytest.raises(ValueError, match="comes after OracleTransform"):
         TransformedEnv(many, make()).reset()
+
+
+def test_a_controller_inside_counts_by_its_action():
+    base = BatchedMujocoEnv("inverted_pendulum", 2, seed=0)
+    both = Composite(action=base.action_spec.clone(), other=base.action_spec.clone(), shape=[2])
+    base.action_spec = both
+    env = TransformedEnv(base, Compose(OracleTransform(), ActuatorBias(0.5, "other")))
+    env.rollout(2)
+    renamed = RenameTransform([], [], ["action"], ["asked"])
+    chain = OracleTransform(), renamed, ActuatorBias(0.5, "asked")
+    with pytest.raises(ValueError, match="ActuatorBias comes after OracleTransform"):
+        TransformedEnv(BatchedMujocoEnv("inverted_pendulum", 2), Compose(*chain)).reset()
 
 
 @pytest.mark.parametrize("rows", [[True, False], [False, False]])

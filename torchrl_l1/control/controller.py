@@ -34,6 +34,7 @@ from torchrl_l1.control.pipeline import (
     Settings,
     carry,
     chain_of,
+    check_resets,
     leaf_spec,
     unspecified,
     warn_of_surroundings,
@@ -230,6 +231,7 @@ class L1Primer(TensorDictPrimer):
         environment = self.container
         if self._is_checked or environment is None:
             return
+        check_resets("L1Controller", environment)
         config = self._shared.settings.complete(environment)
         if self.check_dt:
             check_time_step("L1Controller", config.dt, environment)

@@ -30,6 +30,7 @@ from torchrl_l1.control.pipeline import (
     Settings,
     carry,
     check_order,
+    check_resets,
     unspecified,
     warn_of_surroundings,
     widen_selection,
@@ -75,6 +76,9 @@ class L1Transform(Transform):
     L1 refuses an order that is wrong, and what it cannot see in the chain it notices at the next
     step: the observation that it reads must be the one that it passed on, and its state that of
     the last step. A change of type or device is none.
+
+    No gradient flows through L1: what the environment receives does not depend on the policy's
+    action in the eyes of autograd.
 
     Action bounds that the configuration leaves open are taken from the action spec where it
     is bounded; infinite bounds in the configuration turn clipping off.
@@ -366,6 +370,7 @@ class L1Transform(Transform):
         if self._layout is not None and self._is_ready:
             return
         layout, parent = self._resolve(), self.parent
+        check_resets("L1Transform", parent)
         config = self._settings.complete(parent)
         if self.check_dt:
             check_time_step("L1Transform", config.dt, parent)

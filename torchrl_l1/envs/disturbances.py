@@ -20,6 +20,7 @@ from torchrl.envs import (
 )
 
 from torchrl_l1.control import L1Transform, OracleTransform
+from torchrl_l1.control.pipeline import action_keys
 
 Draw = Callable[[torch.Size], Tensor]
 """Makes values of a shape, or with one for all entries: drawn again as that environment resets."""
@@ -122,10 +123,12 @@ class EnvironmentTransform(Transform):
             if isinstance(inside, SerialEnv):
                 inside = next(iter(inside.__dict__.get("_envs", [])), None)
             else:
-                before += inside.transform.modules()
+                before = [*inside.transform.modules(), *before]
                 inside = inside.base_env
-        for earlier in before if self.disturbs == "action" else ():
-            if isinstance(earlier, (L1Transform, OracleTransform)):
+        keys = action_keys(before, self.key)[1:] if self.disturbs == "action" else ()
+        for earlier, key in zip(before, keys, strict=False):
+            is_controller = isinstance(earlier, (L1Transform, OracleTransform))
+            if is_controller and earlier.action_key == key:
                 other = type(earlier).__name__
                 raise ValueError(
                     f"{mine} comes after {other}, so that it disturbs the policy's action and not "
