@@ -8,8 +8,10 @@ import gymnasium
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import (
+    ActionScaling,
     Compose,
     EnvBase,
     FrameSkipTransform,
@@ -17,12 +19,15 @@ from torchrl.envs import (
     GymWrapper,
     SerialEnv,
     StepCounter,
+    Transform,
     TransformedEnv,
     VecNorm,
     VecNormV2,
 )
 
 from torchrl_l1.control import L1Controller, L1Transform
+from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.envs import BatchedMujocoEnv
 
 pendulum = partial(GymEnv, "Pendulum-v1")
 
@@ -128,3 +133,30 @@ def test_bounds_beyond_those_of_the_environment_are_noticed(face):
     # Less authority is a choice, and infinite bounds say that the spec is wrong.
     for bound in (1.0, 2.0, math.inf):
         with_face(face, pendulum(), action_low=-bound, action_high=bound).reset()
+
+
+def test_actions_in_other_units_than_those_of_the_fit_are_noticed():
+    torch.manual_seed(0)
+
+    def wrapped(*transforms: Transform) -> TransformedEnv:
+        scaled = ActionScaling(), L1Transform(ensemble, dt=0.04)
+        base = BatchedMujocoEnv("inverted_pendulum", 2, seed=0)  # of actions within 3 either way
+        return TransformedEnv(base, Compose(*(transforms or scaled)))
+
+    ensemble = EnsembleDynamics(4, 1, members=2, hidden=(8,))
+    wrapped().reset()  # nothing is known of a fit
+    ensemble.fit_statistics(torch.randn(500, 4), 6 * torch.rand(500, 1) - 3, torch.randn(500, 4))
+    with pytest.warns(
+        UserWarning, match=r"actions far beyond .* entries \[0\]: other units\? Put A"
+    ):
+        wrapped().reset()
+    controller = L1Controller(ensemble, dt=0.04)
+    env = wrapped(ActionScaling(), controller.make_primer())
+    policy = TensorDictModule(lambda x: x[..., :1], ["observation"], ["action"])
+    with pytest.warns(UserWarning, match="other units"):
+        env.rollout(1, TensorDictSequential(policy, controller))
+    wrapped(L1Transform(ensemble, dt=0.04), ActionScaling()).reset()
+    # Of all actions within the bounds those at their ends have the largest deviation.
+    ends = 1 - 2 * torch.randint(2, (500, 1)).float()
+    ensemble.fit_statistics(torch.randn(500, 4), ends, torch.randn(500, 4))
+    wrapped().reset()

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, LazyTensorStorage, ReplayBuffer, Unbounded
+from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import (
     Compose,
     ConditionalSkip,
@@ -434,22 +434,6 @@ def test_steps_left_out_where_the_batch_is_not_locked_are_refused(make):
     # Another number of environments may begin.
     three = env.reset(env.base_env.gen_params(batch_size=[3]), set_state=True)
     env.rollout(3, auto_reset=False, tensordict=three)
-
-
-@pytest.mark.parametrize("make", [lambda: ActuatorBias(0.5), lambda: ActionNoise(0.5)])
-def test_stored_data_are_refused(make):
-    data = TensorDict({"action": torch.zeros(2, 1)}, batch_size=[2])
-    buffer = ReplayBuffer(storage=LazyTensorStorage(4), transform=make())
-    with pytest.raises(RuntimeError, match=r"belongs to an environment .*not to a replay buffer"):
-        buffer.extend(data)
-
-
-def test_weights_of_another_environment_do_not_change_the_disturbance():
-    env = TransformedEnv(Echo(), ActuatorBias(0.5))
-    env.load_state_dict(TransformedEnv(Echo(), ActuatorBias(0.25)).state_dict())
-    env.reset()
-    zero = torch.zeros(3, 2, dtype=torch.float64)
-    assert send(env, zero).unique().tolist() == [0.5]
 
 
 def test_frames_around_a_disturbance_are_disturbed_once_each():

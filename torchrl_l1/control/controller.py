@@ -37,6 +37,7 @@ from torchrl_l1.control.pipeline import (
     check_resets,
     leaf_spec,
     unspecified,
+    warn_of_action_units,
     warn_of_surroundings,
     widen_selection,
 )
@@ -447,6 +448,7 @@ class L1Controller(TensorDictModuleBase):
                     UserWarning,
                     stacklevel=3,
                 )
+            warn_of_action_units(self.model.dynamics, config.action_low, config.action_high)
             self._step = make_step(config, self.model, self.compile_mode, self.diagnostics)
             self._step_config = config
         return self._step

@@ -8,9 +8,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
-from torch import nn
+from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import (
@@ -28,9 +29,13 @@ from torchrl.envs.transforms import (
 )
 
 from torchrl_l1.control.config import L1Config, Scalars, with_open_bounds
+from torchrl_l1.control.probe import describe
 from torchrl_l1.control.step_time import time_step
 
 _TOLERANCE = 1e-4
+
+# Actions of a policy that does not keep to the bounds may be a little beyond them.
+_FAR = 1.5
 
 # In place of a time step that is not known yet: so short that no setting is too fast for it.
 _SHORT = 1e-6
@@ -321,6 +326,33 @@ def warn_of_surroundings(
             "it behind L1 with separate out_keys",
             UserWarning,
             stacklevel=3,
+        )
+
+
+def warn_of_action_units(dynamics: object, low: Scalars | None, high: Scalars | None) -> None:
+    """Say so where a model has been fitted to actions far beyond the bounds of L1.
+
+    The data's mean and deviation tell: from the middle of the bounds their root mean square is at
+    most half the range, whatever the actions within are.
+    """
+    normalizer = getattr(dynamics, "action_normalizer", None)
+    mean, std = getattr(normalizer, "mean", None), getattr(normalizer, "std", None)
+    limit = getattr(getattr(dynamics, "box", None), "high", None)
+    if low is None or high is None or not isinstance(mean, Tensor) or not isinstance(std, Tensor):
+        return
+    if not (isinstance(limit, Tensor) and limit.isfinite().all()):
+        return  # not fitted yet
+    bottom, top = torch.as_tensor(low).to(mean), torch.as_tensor(high).to(mean)
+    if not all(bound.ndim == 0 or bound.shape == mean.shape for bound in (bottom, top)):
+        return
+    size = (std.square() + (mean - (bottom + top) / 2).square()).sqrt()
+    beyond = (size > _FAR * (top - bottom) / 2) & size.isfinite()
+    if beyond.any():
+        warnings.warn(
+            f"{describe(dynamics)} was fitted to actions far beyond the bounds of L1, in the "
+            f"entries {beyond.nonzero().flatten().tolist()}: other units? Put ActionScaling after "
+            "L1, Compose(..., L1Transform(...), ActionScaling())",
+            stacklevel=2,
         )
 
 

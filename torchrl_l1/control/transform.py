@@ -32,6 +32,7 @@ from torchrl_l1.control.pipeline import (
     check_order,
     check_resets,
     unspecified,
+    warn_of_action_units,
     warn_of_surroundings,
     widen_selection,
 )
@@ -378,6 +379,7 @@ class L1Transform(Transform):
         spec = layout.low, layout.high
         warn_of_surroundings("L1Transform", parent, self.observation_key, bounds, spec)
         config = layout.bounded(config)
+        warn_of_action_units(self.model.dynamics, config.action_low, config.action_high)
         if self._step_function is None or config != self._step_config:
             self._step_function = make_step(config, self.model, self.compile_mode, self.diagnostics)
             self._step_config = config
