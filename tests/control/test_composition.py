@@ -22,11 +22,14 @@ from torchrl.envs import (
     ExcludeTransform,
     FrameSkipTransform,
     GymEnv,
+    InitTracker,
+    NextObservationDelta,
     ObservationNorm,
     RenameTransform,
     RewardSum,
     SelectTransform,
     StepCounter,
+    TargetReturn,
     Transform,
 )
 
@@ -71,6 +74,14 @@ RIGHT: dict[str, tuple[Sequence[str], dict[str, Any]]] = {
     "two environments": (BOTH, two),
     "counters after": (BOTH, {"after": [partial(StepCounter, 3), RewardSum]}),
     "counters after, two": (BOTH, {"after": [partial(StepCounter, 3)], **two}),
+    "starts told after": (BOTH, {"after": [InitTracker]}),
+    "starts told after, two": (BOTH, {"after": [InitTracker], **two}),
+    "return to come after": (BOTH, {"after": [partial(TargetReturn, 10.0)]}),
+    "all stored as changes": (BOTH, {"after": [NextObservationDelta]}),
+    "observation stored as changes": (
+        BOTH,
+        {"after": [partial(NextObservationDelta, ["observation"])]},
+    ),
     "normaliser before": (BOTH, {"before": [partial(ObservationNorm, 0.1, 2.0, ["observation"])]}),
     "normaliser with its own key": (BOTH, {"after": [partial(normaliser, out_keys=["normal"])]}),
     "normaliser outside with its own key": (

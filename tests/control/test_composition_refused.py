@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torchrl.envs import (
     CatFrames,
     Compose,
+    ConditionalPolicySwitch,
     DTypeCastTransform,
     ExcludeTransform,
     FrameSkipTransform,
@@ -227,6 +228,26 @@ WRONG: dict[str, tuple[Sequence[str], dict[str, Any], type[Exception], str]] = {
             (Compensated,),
         )
     },
+    **{
+        f"policy switched {where}": (
+            ("transform",),
+            {where: [partial(ConditionalPolicySwitch, actor(), lambda data: True)]},
+            ValueError,
+            "ConditionalPolicySwitch beside L1Transform lets its policy take steps past it",
+        )
+        for where in ("before", "after")
+    },
+    "disturbed under another name after": (
+        ("transform",),
+        {
+            "after": [
+                partial(RenameTransform, [], [], ["action"], ["asked"]),
+                partial(ActuatorBias, 0.5, "asked"),
+            ]
+        },
+        ValueError,
+        DISTURBS.format("ActuatorBias"),
+    ),
     "dt of one frame with three": (
         BOTH,
         {"before": [partial(FrameSkipTransform, 3)], "dt": 0.05},

@@ -5,13 +5,16 @@ import shutil
 import sys
 import sysconfig
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from torch._dynamo.exc import TorchDynamoException
+from torchrl.data import Composite, OneHot, Unbounded
 
 from torchrl_l1.control import ActionJacobian, L1Config, augment, init, law
 from torchrl_l1.control.affine import BLOCK, make_step
+from torchrl_l1.control.layout import Layout
 from torchrl_l1.dynamics import EnsembleDynamics
 
 HEADERS = Path(sysconfig.get_path("include")) / "Python.h"
@@ -88,6 +91,18 @@ def test_a_model_of_another_kind_sees_the_whole_batch():
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("spec", [OneHot(3, dtype=torch.float32), Unbounded((3,))])
+def test_actions_that_are_a_choice_are_refused(spec):
+    observation = Composite(observation=Unbounded((3,)))
+    specs = {"full_observation_spec": observation, "full_action_spec": Composite(action=spec)}
+    env = SimpleNamespace(**specs, batch_size=torch.Size([]), device=None)
+    if isinstance(spec, Unbounded):
+        assert Layout.of(env, "observation", "action").action_dim == 3
+        return
+    with pytest.raises(ValueError, match="as action 'action', but its spec is OneHot"):
+        Layout.of(env, "observation", "action")
+
+
 def test_without_diagnostics_they_are_not_computed(monkeypatch):
     model = ActionJacobian(EnsembleDynamics(4, 1, members=2, hidden=(8,)))
     config = L1Config(0.04, epsilon=0.05, action_low=-1.0, action_high=1.0)

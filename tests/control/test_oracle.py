@@ -218,6 +218,14 @@ def test_a_disturbance_of_another_action_is_none_of_its_business() -> None:
     assert after["beside", "u_exec"].unique().tolist() == [1.5]
 
 
+def test_a_disturbance_of_the_action_under_another_name_is_undone_too() -> None:
+    renamed = RenameTransform([], [], ["action"], ["torque"])
+    env, received = environment(ActuatorBias(0.5), renamed, OracleTransform("torque"))
+    data = env.step(env.reset().set("torque", ONES))
+    assert data["next", "l1", "u_exec"].unique().tolist() == [0.5]
+    assert received.last.unique().tolist() == [1.0]
+
+
 def test_bounds_are_those_where_it_stands() -> None:
     scaling, received = ActionScaling(), Received()
     base = BatchedMujocoEnv("inverted_pendulum", 3, seed=0)  # which takes three to either side

@@ -7,7 +7,11 @@ from typing import Any
 import gymnasium
 import pytest
 import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import (
+    ActionScaling,
     Compose,
     EnvBase,
     FrameSkipTransform,
@@ -15,12 +19,15 @@ from torchrl.envs import (
     GymWrapper,
     SerialEnv,
     StepCounter,
+    Transform,
     TransformedEnv,
     VecNorm,
     VecNormV2,
 )
 
 from torchrl_l1.control import L1Controller, L1Transform
+from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.envs import BatchedMujocoEnv
 
 pendulum = partial(GymEnv, "Pendulum-v1")
 
@@ -50,6 +57,26 @@ def gymnasium_normalised(frozen: bool) -> GymWrapper:
     env = gymnasium.wrappers.NormalizeObservation(gymnasium.make("Pendulum-v1"))
     env.update_running_mean = not frozen
     return GymWrapper(env)
+
+
+class Agents(EnvBase):
+    """Two agents, each with a ``done`` of its own."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_spec = Composite(observation=Unbounded((3,)))
+        self.action_spec = Composite(action=Bounded(-1, 1, (1,)))
+        done = Binary(shape=(2, 1), dtype=torch.bool)
+        self.full_done_spec = Composite(agent=Composite(done=done, terminated=done.clone()))
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+    def _reset(self, tensordict: Any = None, **kwargs: Any) -> TensorDict:
+        return self.full_observation_spec.zero().update(self.full_done_spec.zero())
+
+    def _step(self, tensordict: TensorDict) -> TensorDict:
+        return self._reset().update(self.full_reward_spec.zero())
 
 
 def with_face(face: str, env: EnvBase, **settings: Any) -> EnvBase:
@@ -84,6 +111,14 @@ def test_statistics_that_change_in_each_environment_are_noticed():
         TransformedEnv(base, L1Transform(model, dt=0.05)).reset()
 
 
+@pytest.mark.parametrize("face", FACES)
+def test_resets_without_a_mask_at_the_root_are_refused(face):
+    with pytest.raises(
+        ValueError, match=r"L1\w+ starts afresh .* resets by \[\('agent', '_reset'\)"
+    ):
+        with_face(face, Agents(), dt=0.05).reset()
+
+
 def test_statistics_that_change_elsewhere_do_not_matter():
     own = VecNormV2(in_keys=["observation"], out_keys=["normal"])
     TransformedEnv(pendulum(), Compose(own, L1Transform(model))).reset()
@@ -98,3 +133,30 @@ def test_bounds_beyond_those_of_the_environment_are_noticed(face):
     # Less authority is a choice, and infinite bounds say that the spec is wrong.
     for bound in (1.0, 2.0, math.inf):
         with_face(face, pendulum(), action_low=-bound, action_high=bound).reset()
+
+
+def test_actions_in_other_units_than_those_of_the_fit_are_noticed():
+    torch.manual_seed(0)
+
+    def wrapped(*transforms: Transform) -> TransformedEnv:
+        scaled = ActionScaling(), L1Transform(ensemble, dt=0.04)
+        base = BatchedMujocoEnv("inverted_pendulum", 2, seed=0)  # of actions within 3 either way
+        return TransformedEnv(base, Compose(*(transforms or scaled)))
+
+    ensemble = EnsembleDynamics(4, 1, members=2, hidden=(8,))
+    wrapped().reset()  # nothing is known of a fit
+    ensemble.fit_statistics(torch.randn(500, 4), 6 * torch.rand(500, 1) - 3, torch.randn(500, 4))
+    with pytest.warns(
+        UserWarning, match=r"actions far beyond .* entries \[0\]: other units\? Put A"
+    ):
+        wrapped().reset()
+    controller = L1Controller(ensemble, dt=0.04)
+    env = wrapped(ActionScaling(), controller.make_primer())
+    policy = TensorDictModule(lambda x: x[..., :1], ["observation"], ["action"])
+    with pytest.warns(UserWarning, match="other units"):
+        env.rollout(1, TensorDictSequential(policy, controller))
+    wrapped(L1Transform(ensemble, dt=0.04), ActionScaling()).reset()
+    # Of all actions within the bounds those at their ends have the largest deviation.
+    ends = 1 - 2 * torch.randint(2, (500, 1)).float()
+    ensemble.fit_statistics(torch.randn(500, 4), ends, torch.randn(500, 4))
+    wrapped().reset()

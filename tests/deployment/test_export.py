@@ -7,11 +7,22 @@ import numpy as np
 import pytest
 import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torchrl.envs import (
+    ActionScaling,
+    CatTensors,
+    Compose,
+    DoubleToFloat,
+    GymEnv,
+    ObservationNorm,
+    StepCounter,
+    TransformedEnv,
+)
 from torchrl.modules import IndependentNormal, ProbabilisticActor, TruncatedNormal
 
 from torchrl_l1.deployment import RobustController, export
 from torchrl_l1.deployment.export import cholesky, cholesky_solve, solve_triangular
 from torchrl_l1.deployment.policies import load_policy
+from torchrl_l1.envs import environment_source
 
 # What torch says of its own exporters.
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -55,6 +66,29 @@ def test_onnx_acts_as_the_original(robust, tmp_path):
         pytest.importorskip(name)
     found = export(robust, tmp_path / "policy.onnx", steps=20)
     assert found.error < 1e-4
+
+
+@pytest.mark.filterwarnings("default")
+def test_transforms_of_the_environment_are_named(robust, tmp_path):
+    def make() -> TransformedEnv:
+        chain = DoubleToFloat(in_keys=["observation"]), ActionScaling(), StepCounter(100)
+        norm = ObservationNorm(0.0, 1.0, in_keys=["observation"], out_keys=["scaled"])
+        joined = CatTensors(["scaled"], "observation", del_keys=False)
+        return TransformedEnv(GymEnv("InvertedPendulum-v5"), Compose(*chain, norm, joined))
+
+    source = environment_source(make)
+    other = RobustController(source, robust.policy, robust.model, robust.configs)
+    names = ("ActionScaling", "ObservationNorm", "CatTensors(scaled)")
+    with pytest.warns(
+        UserWarning, match=r"send on its actions, through ActionScaling, Obs.*scaled"
+    ):
+        assert export(other, tmp_path / "policy.pt", steps=5).transforms == names
+    assert export(robust, tmp_path / "policy.pt", steps=5).transforms == ()
+
+
+def test_presets_that_there_are_not_are_named(robust, tmp_path):
+    with pytest.raises(ValueError, match=r"preset.*'papr'"):
+        export(robust, tmp_path / "policy.pt", preset="papr")
 
 
 def test_what_is_not_made_of_torchs_operations_is_refused(robust, tmp_path):

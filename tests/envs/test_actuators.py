@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import (
     Compose,
     ConditionalSkip,
@@ -22,9 +22,11 @@ from torchrl.envs import (
     MultiAction,
     NoopResetEnv,
     PendulumEnv,
+    RenameTransform,
     SerialEnv,
     Transform,
     TransformedEnv,
+    UnsqueezeTransform,
 )
 from torchrl.envs.utils import check_env_specs
 
@@ -41,6 +43,7 @@ from torchrl_l1.envs import (
     RandomSigns,
     SensorBias,
     SensorDelay,
+    SensorDropout,
     SineBias,
     StepBias,
     Stiction,
@@ -81,6 +84,16 @@ def send(env: EnvBase, action: Tensor) -> Tensor:
 def restart(env: EnvBase, rows: list[bool]) -> None:
     mask = torch.tensor(rows).unsqueeze(-1)
     env.reset(TensorDict({"_reset": mask}, batch_size=env.batch_size))
+
+
+class EchoOfAgents(Echo):
+    """Its only ``done`` is that of two agents."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        done = Binary(shape=(3, 2, 1), dtype=torch.bool)
+        agent = Composite(done=done, terminated=done.clone(), shape=[3])
+        self.full_done_spec = Composite(agent=agent, shape=[3])
 
 
 MATCHED = [
@@ -350,6 +363,18 @@ def test_a_controller_inside_is_refused(make, auto_unwrap):
         TransformedEnv(many, make()).reset()
 
 
+def test_a_controller_inside_counts_by_its_action():
+    base = BatchedMujocoEnv("inverted_pendulum", 2, seed=0)
+    both = Composite(action=base.action_spec.clone(), other=base.action_spec.clone(), shape=[2])
+    base.action_spec = both
+    env = TransformedEnv(base, Compose(OracleTransform(), ActuatorBias(0.5, "other")))
+    env.rollout(2)
+    renamed = RenameTransform([], [], ["action"], ["asked"])
+    chain = OracleTransform(), renamed, ActuatorBias(0.5, "asked")
+    with pytest.raises(ValueError, match="ActuatorBias comes after OracleTransform"):
+        TransformedEnv(BatchedMujocoEnv("inverted_pendulum", 2), Compose(*chain)).reset()
+
+
 @pytest.mark.parametrize("rows", [[True, False], [False, False]])
 def test_a_step_that_is_skipped_changes_no_state(rows):
     stepped = torch.tensor(rows).unsqueeze(-1)
@@ -366,6 +391,49 @@ def test_a_step_that_is_skipped_changes_no_state(rows):
         expected = [0.2 if row else 0.1 for row in rows]
         assert received[2].tolist() == pytest.approx(expected)
         assert received[3].tolist() == pytest.approx([0.3, 0.3])
+
+
+def test_the_mask_of_a_reset_may_be_nested():
+    env = TransformedEnv(EchoOfAgents(), StepBias(0.5, at=2))
+    env.reset()
+    zero = torch.zeros(3, 2, dtype=torch.float64)
+    for _ in range(2):
+        assert not send(env, zero).any()
+    mask = torch.tensor([[False, False], [False, True], [False, False]]).unsqueeze(-1)
+    state = env.full_done_spec.zero().set(("agent", "_reset"), mask)
+    env.reset(state)
+    assert send(env, zero)[:, 0].tolist() == [0.5, 0.0, 0.5]
+
+
+def pendulums(*transforms: Transform) -> tuple[TransformedEnv, TensorDict]:
+    """Two of TorchRL's own pendulums, which are not batch-locked, and their first state."""
+    vector = UnsqueezeTransform(-1, in_keys=["th"], out_keys=["observation"])
+    env = TransformedEnv(PendulumEnv(), Compose(vector, *transforms))
+    return env, env.reset(env.base_env.gen_params(batch_size=[2]), set_state=True)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: SineBias(0.5),
+        lambda: StepBias(0.5, at=1),
+        lambda: ActuatorDelay(1),
+        lambda: SensorDelay(1),
+        lambda: SensorDropout(0.5),
+    ],
+)
+def test_steps_left_out_where_the_batch_is_not_locked_are_refused(make):
+    skip = ConditionalSkip(lambda data: torch.tensor([True, False]))
+    env, state = pendulums(skip, transform := make())
+    with pytest.raises(ValueError, match=rf"{type(transform).__name__} .*steps cannot be left out"):
+        env.rollout(3, auto_reset=False, tensordict=state)
+    env, state = pendulums(make())
+    env.step(env.rand_action(state))
+    with pytest.raises(ValueError, match=r"batch \(2,\), but \(1,\) steps.* not batch-locked"):
+        env.step(env.rand_action(state[:1]))
+    # Another number of environments may begin.
+    three = env.reset(env.base_env.gen_params(batch_size=[3]), set_state=True)
+    env.rollout(3, auto_reset=False, tensordict=three)
 
 
 def test_frames_around_a_disturbance_are_disturbed_once_each():

@@ -6,11 +6,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_l1.envs import (
     DISTURBANCES,
     SUITES,
+    ActionNoise,
+    ActuatorBias,
     BatchedMujocoEnv,
     Perturbation,
     Uniform,
@@ -53,6 +57,20 @@ def test_neutral_values_are_left_out_and_the_motion_is_bit_identical():
         torch.manual_seed(0)
         rollouts.append(one.rollout(50, break_when_any_done=False))
     assert (rollouts[0] == rollouts[1]).all()
+
+
+@pytest.mark.parametrize("make", [lambda: ActuatorBias(0.5), lambda: ActionNoise(0.5)])
+def test_stored_data_are_refused(make):
+    data = TensorDict({"action": torch.zeros(2, 1)}, batch_size=[2])
+    buffer = ReplayBuffer(storage=LazyTensorStorage(4), transform=make())
+    with pytest.raises(RuntimeError, match=r"belongs to an environment .*not to a replay buffer"):
+        buffer.extend(data)
+
+
+def test_weights_of_another_environment_do_not_change_the_disturbance():
+    env, other = (make_env("hopper", bias=bias) for bias in (0.5, 0.25))
+    env.load_state_dict(other.state_dict())
+    assert env.transform[0].value == 0.5
 
 
 def test_chain_of_all():

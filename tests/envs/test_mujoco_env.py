@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import copy
+import multiprocessing
 import pickle
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,14 +11,25 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torchrl.envs import MultiAction, TransformedEnv
+from torchrl.envs import MultiAction, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_l1.envs import TASKS, BatchedMujocoEnv, BatchedSimulator
+from torchrl_l1.envs import (
+    TASKS,
+    BatchedMujocoEnv,
+    BatchedSimulator,
+    ExternalEnv,
+    ExternalTask,
+    environment_source,
+)
 
 
 def _step(env, action):
     return env.step(TensorDict({"action": action}, batch_size=env.batch_size))["next"]
+
+
+def pendulums(count: int) -> ExternalEnv:
+    return ExternalTask(environment_source("gymnasium/Pendulum-v1")).environment(count)
 
 
 def test_derived_quantities_belong_to_the_state_that_was_set():
@@ -126,6 +139,26 @@ def test_seeds():
     assert (record(env) == first).all()
     env.set_seed(8)
     assert not torch.equal(record(env)["observation"], first["observation"])
+
+
+@pytest.mark.parametrize("make", [partial(BatchedMujocoEnv, "hopper"), pendulums])
+def test_workers_without_a_seed_differ(make, monkeypatch):
+    starts = []
+    for worker in ((), (1,), (2,), (1, 1), (1,)):
+        monkeypatch.setattr(multiprocessing.current_process(), "_identity", worker)
+        torch.manual_seed(3)  # what a fork copies
+        starts.append(make(1).reset()["observation"])
+    assert len({str(start.tolist()) for start in starts}) == 4
+    assert torch.equal(starts[1], starts[4])
+
+
+@pytest.mark.parametrize("make", [partial(BatchedMujocoEnv, "hopper"), pendulums])
+def test_the_physics_stays_on_the_cpu(make):
+    env = make(1)
+    assert env.to("cpu") is env
+    with pytest.raises(ValueError, match=r"steps on the CPU.*DeviceCastTransform\('meta'\)"):
+        TransformedEnv(env, StepCounter()).to("meta")
+    assert env.reset().device == torch.device("cpu")
 
 
 def test_without_a_seed_torch_manual_seed_decides():

@@ -35,5 +35,7 @@ def export_command(options: argparse.Namespace) -> None:
     )
     print(f"Inputs:  {', '.join(found.inputs)}")
     print(f"Outputs: {', '.join(found.outputs)}")
+    if found.transforms:
+        print(f"Outside: {', '.join(found.transforms)}")
     print(f"Largest difference in {found.steps} steps: {found.error:.3g} action units")
     print(f"File: {found.file}")

@@ -34,8 +34,10 @@ from torchrl_l1.control.pipeline import (
     Settings,
     carry,
     chain_of,
+    check_resets,
     leaf_spec,
     unspecified,
+    warn_of_action_units,
     warn_of_surroundings,
     widen_selection,
 )
@@ -230,6 +232,7 @@ class L1Primer(TensorDictPrimer):
         environment = self.container
         if self._is_checked or environment is None:
             return
+        check_resets("L1Controller", environment)
         config = self._shared.settings.complete(environment)
         if self.check_dt:
             check_time_step("L1Controller", config.dt, environment)
@@ -445,6 +448,7 @@ class L1Controller(TensorDictModuleBase):
                     UserWarning,
                     stacklevel=3,
                 )
+            warn_of_action_units(self.model.dynamics, config.action_low, config.action_high)
             self._step = make_step(config, self.model, self.compile_mode, self.diagnostics)
             self._step_config = config
         return self._step

@@ -155,10 +155,12 @@ def _vector_spec(env: EnvBase, kind: str, key: NestedKey) -> TensorSpec:
         found = sorted(map(str, specs.keys(include_nested=True, leaves_only=True)))
         raise KeyError(f"the environment has no {kind} {key!r}, only {found}: see {kind}_key")
     spec = specs[key]
-    if not spec.dtype.is_floating_point or spec.ndim != len(env.batch_size) + 1:
+    is_continuous = kind == "observation" or isinstance(spec, (Bounded, Unbounded))
+    is_vector = spec.dtype.is_floating_point and spec.ndim == len(env.batch_size) + 1
+    if not (is_continuous and is_vector):
         raise ValueError(
-            f"L1 needs a vector of floating-point numbers as {kind} {key!r}, but its spec has "
-            f"shape {tuple(spec.shape)} and type {spec.dtype}"
+            f"L1 needs a vector of floating-point numbers as {kind} {key!r}, but its spec is "
+            f"{type(spec).__name__} of shape {tuple(spec.shape)} and type {spec.dtype}"
         )
     return spec
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import takewhile
 
 import torch
 from tensordict import TensorDictBase
@@ -15,12 +16,13 @@ from torchrl.envs.transforms import (
     Compose,
     DeviceCastTransform,
     DTypeCastTransform,
+    RenameTransform,
     Transform,
 )
 
 from torchrl_l1.control.controller import L1Primer
 from torchrl_l1.control.layout import L1_KEY, entry_name, required_entry
-from torchrl_l1.control.pipeline import transforms_of
+from torchrl_l1.control.pipeline import action_keys, transforms_of
 from torchrl_l1.control.transform import L1Transform
 
 
@@ -45,6 +47,8 @@ class OracleTransform(Transform):
     returns, without a side effect, the action which, sent through the transform at this step,
     makes the plant receive ``action``.
 
+    No gradient flows through the oracle, as none does through L1.
+
     ``action`` stays the policy's, and ``("next", key, "u_exec")`` holds the executed input, as
     with ``L1Transform``, which this takes the place of: it must come after the disturbances, and
     there must not be both.
@@ -56,7 +60,7 @@ class OracleTransform(Transform):
     Raises:
         ValueError: at a reset, if a transform that maps actions to other units stands between a
             disturbance and the oracle, if there is another controller, or if disturbances are
-            within the members of a batched environment, each in its own.
+            within the members of a ``SerialEnv``; those of other processes are not asked.
         KeyError: at a step, if there is no action.
         RuntimeError: if used in a replay buffer.
 
@@ -152,27 +156,30 @@ class OracleTransform(Transform):
         An action meets the last transform first and the plant last: what the plant is to receive
         is traced back from the first transform, of the innermost environment.
         """
-        undone = ""
-        for transform in transforms_of(self._environment()):
-            if transform is self:
-                return
+        undone, before = "", self._before()
+        keys = action_keys(before, self.action_key)
+        for transform, key in zip(before, keys[1:], strict=True):
             compensate = getattr(transform, "compensate", None)
-            if compensate is not None and self._is_of_this_action(transform, "key"):
+            if compensate is not None and _has_key(transform, "key", key):
                 undone = type(transform).__name__
                 yield compensate
-            elif undone and self._changes_units(transform):
+            elif undone and _changes_units(transform, key):
                 name = type(transform).__name__
                 raise ValueError(
                     f"{name} stands between {undone} and OracleTransform, which would undo the one "
                     f"in the units of the other: put {name} after OracleTransform"
                 )
 
+    def _before(self) -> list[nn.Module]:
+        """The transforms before this one, of the innermost environment first."""
+        return list(takewhile(lambda one: one is not self, transforms_of(self._environment())))
+
     def _check_surroundings(self) -> None:
         environment = self._environment()
         for transform in transforms_of(environment):
             is_controller = isinstance(transform, (L1Primer, L1Transform, OracleTransform))
             is_other = is_controller and transform is not self
-            if is_other and self._is_of_this_action(transform, "action_key"):
+            if is_other and _has_key(transform, "action_key", self.action_key):
                 raise ValueError(
                     f"{type(transform).__name__} is there beside OracleTransform, and both would "
                     "act against one disturbance: leave one of them out"
@@ -180,9 +187,10 @@ class OracleTransform(Transform):
         while isinstance(environment, TransformedEnv):
             environment = environment.base_env
         members = environment.__dict__.get("_envs", []) if type(environment) is SerialEnv else []
+        key, *_ = action_keys(self._before(), self.action_key)
         for transform in (inner for member in members for inner in transforms_of(member)):
             disturbs = callable(getattr(transform, "compensate", None))
-            if disturbs and self._is_of_this_action(transform, "key"):
+            if disturbs and _has_key(transform, "key", key):
                 name = type(transform).__name__
                 raise ValueError(
                     f"{name} is within the members of a SerialEnv, where OracleTransform does not "
@@ -190,14 +198,17 @@ class OracleTransform(Transform):
                     "OracleTransform()))"
                 )
 
-    def _is_of_this_action(self, transform: nn.Module, name: str) -> bool:
-        return unravel_key(getattr(transform, name, self.action_key)) == self.action_key
-
-    def _changes_units(self, transform: object) -> bool:
-        if isinstance(transform, (Compose, DTypeCastTransform, DeviceCastTransform)):
-            return False
-        keys = getattr(transform, "in_keys_inv", None) or ()
-        return isinstance(transform, ActionScaling) or self.action_key in map(unravel_key, keys)
-
     def __repr__(self) -> str:
         return f"{type(self).__name__}(key={self.key!r})"
+
+
+def _has_key(transform: nn.Module, name: str, key: NestedKey) -> bool:
+    return unravel_key(getattr(transform, name, key)) == key
+
+
+def _changes_units(transform: nn.Module, key: NestedKey) -> bool:
+    unchanged = Compose, DTypeCastTransform, DeviceCastTransform, RenameTransform
+    if isinstance(transform, unchanged):
+        return False
+    keys = getattr(transform, "out_keys_inv", None) or ()
+    return isinstance(transform, ActionScaling) or key in map(unravel_key, keys)

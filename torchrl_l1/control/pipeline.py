@@ -8,17 +8,20 @@ from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
-from torch import nn
+from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import (
     Compose,
+    ConditionalPolicySwitch,
     DeviceCastTransform,
     DTypeCastTransform,
     ExcludeTransform,
     FrameSkipTransform,
+    NextObservationDelta,
     SelectTransform,
     Transform,
     VecNorm,
@@ -26,9 +29,13 @@ from torchrl.envs.transforms import (
 )
 
 from torchrl_l1.control.config import L1Config, Scalars, with_open_bounds
+from torchrl_l1.control.probe import describe
 from torchrl_l1.control.step_time import time_step
 
 _TOLERANCE = 1e-4
+
+# Actions of a policy that does not keep to the bounds may be a little beyond them.
+_FAR = 1.5
 
 # In place of a time step that is not known yet: so short that no setting is too fast for it.
 _SHORT = 1e-6
@@ -62,6 +69,38 @@ def transforms_of(environment: EnvBase) -> list[nn.Module]:
     return [member for chain in reversed(chains) for member in chain.modules()]
 
 
+def action_keys(transforms: Sequence[nn.Module], key: NestedKey) -> list[NestedKey]:
+    """Keys of an action on its way through transforms, which may rename it.
+
+    Args:
+        transforms: in the order of ``Compose``; an action meets the last one first.
+        key: under which the last one receives it.
+
+    Returns:
+        the key behind the first one, then those under which each receives it.
+    """
+    keys = [key := unravel_key(key)]
+    for transform in reversed(transforms):
+        if not isinstance(transform, (DTypeCastTransform, DeviceCastTransform)):
+            names = (getattr(transform, f"{side}_keys_inv", None) or () for side in ("out", "in"))
+            key = dict(zip(*names, strict=False)).get(key, key)
+        keys.append(key)
+    return keys[::-1]
+
+
+def check_resets(owner: str, env: EnvBase) -> None:
+    """Refuse an environment whose resets L1, with its state at the root, would not be told.
+
+    Raises:
+        ValueError: naming the masks that there are.
+    """
+    if "_reset" not in env.reset_keys:
+        raise ValueError(
+            f"{owner} starts afresh where a root '_reset' says so, but this environment resets by "
+            f"{env.reset_keys} only: give it a 'done' at its root, for each of its batch"
+        )
+
+
 def check_order(
     l1: Transform,
     observation_key: NestedKey,
@@ -80,7 +119,12 @@ def check_order(
     owner = type(l1).__name__
     chain = chain_of(l1)
     position = next(index for index, member in enumerate(chain) if member is l1)
-    for later in chain[position + 1 :]:
+    if any(isinstance(member, ConditionalPolicySwitch) for member in chain):
+        raise ValueError(
+            f"ConditionalPolicySwitch beside {owner} lets its policy take steps past it: make the "
+            "choice within the policy"
+        )
+    for index, later in enumerate(chain[position + 1 :], position + 1):
         name = type(later).__name__
         order = f"write Compose(..., {name}(...), {owner}(...))"
         disturbs = getattr(later, "disturbs", None)
@@ -91,7 +135,8 @@ def check_order(
                 f"{name} comes after {owner} and would apply it again to its own output: {order}, "
                 f"with the dt of {later.frame_skip} frames"
             )
-        if disturbs == "action" and getattr(later, "key", action_key) == action_key:
+        acts_on, *_ = action_keys(chain[position + 1 : index], getattr(later, "key", action_key))
+        if disturbs == "action" and acts_on == action_key:
             raise ValueError(
                 f"{name} comes after {owner}, so that it disturbs the policy's action and not what "
                 f"{owner} sends to the actuators: {order}"
@@ -114,10 +159,14 @@ def check_order(
 
 
 def _written(transform: Transform) -> list[NestedKey]:
-    # A change of type or device is none of the observation.
-    if isinstance(transform, (DTypeCastTransform, DeviceCastTransform)):
+    # A change of type or device is none of the observation, and what NextObservationDelta drops
+    # has been passed on.
+    if isinstance(transform, (DTypeCastTransform, DeviceCastTransform, NextObservationDelta)):
         return []
-    return list(transform.out_keys)
+    try:
+        return list(transform.out_keys)
+    except (AttributeError, NotImplementedError):
+        return []  # of its own, such as "is_init", which wait for the environment
 
 
 def _excluded(transform: Transform, key: str, names: Sequence[str]) -> list[str]:
@@ -277,6 +326,33 @@ def warn_of_surroundings(
             "it behind L1 with separate out_keys",
             UserWarning,
             stacklevel=3,
+        )
+
+
+def warn_of_action_units(dynamics: object, low: Scalars | None, high: Scalars | None) -> None:
+    """Say so where a model has been fitted to actions far beyond the bounds of L1.
+
+    The data's mean and deviation tell: from the middle of the bounds their root mean square is at
+    most half the range, whatever the actions within are.
+    """
+    normalizer = getattr(dynamics, "action_normalizer", None)
+    mean, std = getattr(normalizer, "mean", None), getattr(normalizer, "std", None)
+    limit = getattr(getattr(dynamics, "box", None), "high", None)
+    if low is None or high is None or not isinstance(mean, Tensor) or not isinstance(std, Tensor):
+        return
+    if not (isinstance(limit, Tensor) and limit.isfinite().all()):
+        return  # not fitted yet
+    bottom, top = torch.as_tensor(low).to(mean), torch.as_tensor(high).to(mean)
+    if not all(bound.ndim == 0 or bound.shape == mean.shape for bound in (bottom, top)):
+        return
+    size = (std.square() + (mean - (bottom + top) / 2).square()).sqrt()
+    beyond = (size > _FAR * (top - bottom) / 2) & size.isfinite()
+    if beyond.any():
+        warnings.warn(
+            f"{describe(dynamics)} was fitted to actions far beyond the bounds of L1, in the "
+            f"entries {beyond.nonzero().flatten().tolist()}: other units? Put ActionScaling after "
+            "L1, Compose(..., L1Transform(...), ActionScaling())",
+            stacklevel=2,
         )
 
 

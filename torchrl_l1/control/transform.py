@@ -30,7 +30,9 @@ from torchrl_l1.control.pipeline import (
     Settings,
     carry,
     check_order,
+    check_resets,
     unspecified,
+    warn_of_action_units,
     warn_of_surroundings,
     widen_selection,
 )
@@ -75,6 +77,9 @@ class L1Transform(Transform):
     L1 refuses an order that is wrong, and what it cannot see in the chain it notices at the next
     step: the observation that it reads must be the one that it passed on, and its state that of
     the last step. A change of type or device is none.
+
+    No gradient flows through L1: what the environment receives does not depend on the policy's
+    action in the eyes of autograd.
 
     Action bounds that the configuration leaves open are taken from the action spec where it
     is bounded; infinite bounds in the configuration turn clipping off.
@@ -366,6 +371,7 @@ class L1Transform(Transform):
         if self._layout is not None and self._is_ready:
             return
         layout, parent = self._resolve(), self.parent
+        check_resets("L1Transform", parent)
         config = self._settings.complete(parent)
         if self.check_dt:
             check_time_step("L1Transform", config.dt, parent)
@@ -373,6 +379,7 @@ class L1Transform(Transform):
         spec = layout.low, layout.high
         warn_of_surroundings("L1Transform", parent, self.observation_key, bounds, spec)
         config = layout.bounded(config)
+        warn_of_action_units(self.model.dynamics, config.action_low, config.action_high)
         if self._step_function is None or config != self._step_config:
             self._step_function = make_step(config, self.model, self.compile_mode, self.diagnostics)
             self._step_config = config

@@ -20,11 +20,13 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.fx.experimental.symbolic_shapes import GuardOnDataDependentSymNode
+from torchrl.envs import CatTensors, Compose, DTypeCastTransform, EnvBase, Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_l1.atomic import write_atomically
 from torchrl_l1.checks import check_choice, check_count
 from torchrl_l1.control import ActionJacobian, L1Config, L1State, L1Transform, augment, init
+from torchrl_l1.control.pipeline import transforms_of
 from torchrl_l1.deployment.assessment import run_episodes
 from torchrl_l1.deployment.policies import FunctionPolicy
 from torchrl_l1.deployment.robust_controller import RobustController
@@ -115,6 +117,8 @@ class Exported:
         outputs: names of the outputs.
         error: largest difference of the executed input on recorded steps, action units.
         steps: how many steps that were.
+        transforms: of the environment, from the plant on, through which observation and action go
+            outside the file; where parts are joined to an observation, with these in order.
     """
 
     file: Path
@@ -122,6 +126,7 @@ class Exported:
     outputs: tuple[str, ...]
     error: float
     steps: int
+    transforms: tuple[str, ...] = ()
 
 
 def export(
@@ -143,6 +148,8 @@ def export(
     :func:`~torchrl_l1.control.init` makes them. All is float32 but ``n_switch`` (int64) and
     ``started`` (bool).
 
+    Observation and action are those behind the environment's transforms, which are not written.
+
     Args:
         robust: what is written.
         file: ``.pt`` or ``.ts`` for TorchScript, ``.onnx``, or ``.pt2`` for a program of
@@ -155,7 +162,7 @@ def export(
         seed: of those steps.
 
     Returns:
-        names of inputs and outputs, and the largest difference.
+        names of inputs and outputs, the largest difference, and what is left to do outside.
 
     Raises:
         OSError: if the file cannot be written there.
@@ -164,7 +171,8 @@ def export(
             ones, as of a policy that decides by values in Python.
 
     Warns:
-        UserWarning: if a trace was made of a policy that looks at values in Python.
+        UserWarning: if a trace was made of a policy that looks at values in Python, or the
+            environment has transforms of the observation or the action.
     """
     file = Path(file)
     format = FORMATS.get(file.suffix, "") if format is None else format
@@ -227,15 +235,41 @@ def export(
             "around them; torch.where has both",
             stacklevel=2,
         )
+    outside = tuple(_outside(robust.source.one()))
+    if outside:
+        warnings.warn(
+            f"{file} does not hold what the environment does between plant and policy: give it "
+            f"observations, and send on its actions, through {', '.join(outside)}",
+            stacklevel=2,
+        )
     write_atomically(file, content)
-    return Exported(file, inputs, outputs, worst, steps)
+    return Exported(file, inputs, outputs, worst, steps, outside)
+
+
+def _outside(env: EnvBase) -> list[str]:
+    """The transforms that an observation has come through, or an action goes through, in words."""
+    transforms = [one for one in transforms_of(env) if isinstance(one, Transform)]
+    observations, actions, found = {"observation"}, {"action"}, []
+    for transform in reversed(transforms):
+        if isinstance(transform, Compose):
+            continue
+        reads = observations.intersection(transform.out_keys)
+        sends = actions.intersection(transform.out_keys_inv)
+        observations |= set(transform.in_keys) if reads else set()
+        actions |= set(transform.in_keys_inv) if sends else set()
+        # A change of type is none here: all is float32.
+        if (reads or sends) and not isinstance(transform, DTypeCastTransform):
+            parts = ", ".join(map(str, transform.in_keys))
+            joins = isinstance(transform, CatTensors)
+            found.append(type(transform).__name__ + f"({parts})" * joins)
+    return found[::-1]
 
 
 def _recorded(
     robust: RobustController, preset: str | None, steps: int, seed: int
 ) -> tuple[L1Config, TensorDictBase]:
     """The settings with the environment's bounds, and steps ``[T]`` of one episode."""
-    transform = L1Transform(robust.model, robust.configs[preset or robust.preset])
+    transform = L1Transform(robust.model, robust.settings(preset))
     with torch.random.fork_rng(devices=[]):
         data = run_episodes(robust.source, robust.policy, {}, [transform], 1, steps, seed)
     spec = vector_bounds(robust)

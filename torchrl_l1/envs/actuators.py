@@ -34,6 +34,7 @@ class _Actuator(HeldDisturbance):
         return {}
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._environment()  # refuses replay buffers
         action = tensordict.get(self.key)
         self._started(action)
         self._check_shape(action)
@@ -44,6 +45,7 @@ class _Actuator(HeldDisturbance):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         # Not before: a transform nearer to the plant may have skipped the step.
         if self._following:
+            self._check_batch(self._following, tensordict.batch_size)
             self._keep(self._following, tensordict.get("_step", None), tensordict.batch_size)
             self._following = {}
         return next_tensordict
@@ -57,7 +59,7 @@ class _Actuator(HeldDisturbance):
             # An environment that is not batch-locked decides on more dimensions at reset.
             extra = tensordict_reset.batch_size[: tensordict_reset.ndim - len(parent.batch_size)]
             action = spec.zero(extra)
-            self._restart(action, tensordict.get("_reset", None))
+            self._restart(action, self.resets(tensordict))
             self.check_order(bool(self._state))
         return tensordict_reset
 

@@ -10,6 +10,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import (
+    EnvBase,
     FrameSkipTransform,
     MultiAction,
     NoopResetEnv,
@@ -19,6 +20,7 @@ from torchrl.envs import (
 )
 
 from torchrl_l1.control import L1Transform, OracleTransform
+from torchrl_l1.control.pipeline import action_keys
 
 Draw = Callable[[torch.Size], Tensor]
 """Makes values of a shape, or with one for all entries: drawn again as that environment resets."""
@@ -111,7 +113,7 @@ class EnvironmentTransform(Transform):
         Raises:
             ValueError: naming the transform and the right order.
         """
-        environment = self.container
+        environment = self._environment()
         if environment is None:
             return
         mine, chain = type(self).__name__, list(environment.transform.modules())
@@ -121,10 +123,12 @@ class EnvironmentTransform(Transform):
             if isinstance(inside, SerialEnv):
                 inside = next(iter(inside.__dict__.get("_envs", [])), None)
             else:
-                before += inside.transform.modules()
+                before = [*inside.transform.modules(), *before]
                 inside = inside.base_env
-        for earlier in before if self.disturbs == "action" else ():
-            if isinstance(earlier, (L1Transform, OracleTransform)):
+        keys = action_keys(before, self.key)[1:] if self.disturbs == "action" else ()
+        for earlier, key in zip(before, keys, strict=False):
+            is_controller = isinstance(earlier, (L1Transform, OracleTransform))
+            if is_controller and earlier.action_key == key:
                 other = type(earlier).__name__
                 raise ValueError(
                     f"{mine} comes after {other}, so that it disturbs the policy's action and not "
@@ -141,6 +145,28 @@ class EnvironmentTransform(Transform):
                     f"{mine}, or around it, TransformedEnv(env, {other}(...), auto_unwrap=False)"
                 )
 
+    def _environment(self) -> EnvBase | None:
+        """The environment, if there is one.
+
+        Raises:
+            RuntimeError: in a replay buffer.
+        """
+        try:
+            return self.container
+        except ValueError:  # TorchRL's answer where the container is a replay buffer
+            raise RuntimeError(self._refusal()) from None
+
+    def resets(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Which environments are reset.
+
+        Returns:
+            mask ``(*batch, 1)``, bool, true where anything of an environment is; ``None`` where
+            all are.
+        """
+        environment = self._environment()
+        keys = ["_reset"] if environment is None else environment.reset_keys
+        return _any_of([tensordict.get(key, None) for key in keys], tensordict.batch_size)
+
     def begun(self, next_tensordict: TensorDictBase) -> Tensor | None:
         """Where an environment that resets itself within a step has begun an episode.
 
@@ -148,14 +174,12 @@ class EnvironmentTransform(Transform):
             mask ``(*batch, 1)``, bool: what is observed there is the first of that episode;
             ``None`` for environments that are reset from outside.
         """
-        environment = self.container
+        environment = self._environment()
         is_native = "_torchrl_native_autoreset"
         if environment is None or not environment.__dict__.get(is_native, False):
             return None
         flags = [next_tensordict.get(key, None) for key in environment.done_keys]
-        batch = next_tensordict.batch_size
-        over = [flag.reshape(*batch, -1).any(-1, True) for flag in flags if flag is not None]
-        return torch.stack(over).any(0)
+        return _any_of(flags, next_tensordict.batch_size)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Refuse to work on stored data.
@@ -163,10 +187,19 @@ class EnvironmentTransform(Transform):
         Raises:
             RuntimeError: always.
         """
-        raise RuntimeError(
+        raise RuntimeError(self._refusal())
+
+    def _refusal(self) -> str:
+        return (
             f"{type(self).__name__} belongs to an environment (TransformedEnv), not to a replay "
             f"buffer or a policy: {self.reason}"
         )
+
+
+def _any_of(flags: Sequence[Tensor | None], batch: torch.Size) -> Tensor | None:
+    """Where any of them is set ``(*batch, 1)``; ``None`` where there are none."""
+    found = [flag.reshape(*batch, -1).any(-1, True) for flag in flags if flag is not None]
+    return torch.stack(found).any(0) if found else None
 
 
 class HeldDisturbance(EnvironmentTransform):
@@ -190,7 +223,8 @@ class HeldDisturbance(EnvironmentTransform):
             )
         if tensor is not None:
             self._check(tensor)
-        self.register_buffer("value", tensor)
+        # It is a setting: weights of another environment must not bring theirs along.
+        self.register_buffer("value", tensor, persistent=False)
         self._state: Mapping[str, Tensor] = {}
         self._following: Mapping[str, Tensor] = {}
 
@@ -219,6 +253,9 @@ class HeldDisturbance(EnvironmentTransform):
 
     def _restart(self, entry: Tensor, reset: Tensor | None) -> None:
         self._check_shape(entry)
+        if reset is None:
+            self._state = {}  # which may have been that of another number of environments
+        self._check_batch(self._state, entry.shape[:-1])
         state = self._drawn(entry)
         self._keep(state, reset, entry.shape[:-1])
         self._keep(self._begin(entry), reset, entry.shape[:-1])
@@ -226,6 +263,21 @@ class HeldDisturbance(EnvironmentTransform):
     def _started(self, entry: Tensor) -> None:
         if not self._state:  # used without an environment that was reset
             self._restart(entry, None)
+        self._check_batch(self._state, entry.shape[:-1])
+
+    def _check_batch(self, state: Mapping[str, Tensor], batch: torch.Size) -> None:
+        """Refuse a state of other environments than those that step or are reset.
+
+        Raises:
+            ValueError: naming the numbers of both.
+        """
+        sizes = {tuple(value.shape[: len(batch)]) for value in state.values()} - {tuple(batch)}
+        if sizes:
+            raise ValueError(
+                f"{type(self).__name__} has a state of batch {sizes.pop()}, but {tuple(batch)} "
+                "steps, of an environment that is not batch-locked: steps cannot be left out there "
+                "(ConditionalSkip, or rollouts that go on without environments that are done)"
+            )
 
     def _keep(self, state: Mapping[str, Tensor], where: Tensor | None, batch: torch.Size) -> None:
         """Make a state the current one, in some environments or in all."""

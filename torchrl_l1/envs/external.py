@@ -13,13 +13,15 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded
-from torchrl.envs import EnvBase, GymEnv, GymWrapper
+from torchrl.envs import GymEnv, GymWrapper
 
 from torchrl_l1.checks import check_optional_count
 from torchrl_l1.envs.known_rewards import Outcome
 from torchrl_l1.envs.mujoco_env import (
     BatchedMujocoEnv,
+    CPUEnv,
     declare_specs,
+    drawn_seed,
     keep_others,
     reset_rows,
     stepped_rows,
@@ -169,7 +171,7 @@ def _scalars(bound: np.ndarray) -> Scalars:
     return entries[0] if len(set(entries)) == 1 else entries
 
 
-class ExternalEnv(EnvBase):
+class ExternalEnv(CPUEnv):
     """Environments of elsewhere side by side in one process, as :class:`BatchedMujocoEnv` has ours.
 
     Every reset of each is seeded from the seed of the whole, so that what follows depends on
@@ -183,7 +185,8 @@ class ExternalEnv(EnvBase):
         num_envs: how many; the batch size is ``[num_envs]``.
 
     Keyword Args:
-        seed: seed of the resets; drawn from torch's global generator if ``None``.
+        seed: seed of the resets; drawn from torch's global generator if ``None``, another one in
+            each worker of :mod:`multiprocessing`.
         max_steps: steps after which an episode is truncated; the task's horizon if ``None``.
         dtype: floating dtype of observation, action and reward.
         threads: no more than one thread steps them.
@@ -228,7 +231,7 @@ class ExternalEnv(EnvBase):
         low, high = (torch.from_numpy(bound).to(dtype) for bound in (self._low, self._high))
         action_spec = Bounded(low, high, low.shape, dtype=dtype)
         declare_specs(self, task.observation_dim, action_spec, dtype)
-        self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
+        self.set_seed(drawn_seed() if seed is None else seed)
 
     def _set_seed(self, seed: int | None) -> None:
         self._rng = np.random.default_rng(seed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Mapping
 
 import mujoco
@@ -10,12 +11,42 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data.utils import DEVICE_TYPING
 from torchrl.envs import EnvBase
 
 from torchrl_l1.envs.plant import PlantValue
 from torchrl_l1.envs.simulation import TaskSimulation
 from torchrl_l1.envs.task import Task
 from torchrl_l1.envs.tasks import built_in_task
+
+
+class CPUEnv(EnvBase):
+    """An environment whose physics is on the CPU."""
+
+    def to(self, device: DEVICE_TYPING) -> EnvBase:
+        """Itself on the CPU.
+
+        Raises:
+            ValueError: for another device.
+        """
+        if torch.device(device).type != "cpu":
+            raise ValueError(
+                f"{type(self).__name__} steps on the CPU; its data may be elsewhere: "
+                f"TransformedEnv(env, DeviceCastTransform({str(device)!r}))"
+            )
+        return super().to(device)
+
+
+def drawn_seed() -> int:
+    """A seed from torch's global generator, of which forked workers have equal copies.
+
+    Those of :mod:`multiprocessing` are told apart by their numbers.
+    """
+    drawn = int(torch.empty((), dtype=torch.int64).random_())
+    worker = multiprocessing.current_process()._identity
+    if not worker:
+        return drawn
+    return int(np.random.SeedSequence([drawn, *worker]).generate_state(1)[0])
 
 
 def declare_specs(
@@ -67,7 +98,7 @@ def keep_others(data: TensorDict, tensordict: TensorDictBase, stepped: Tensor) -
     return data
 
 
-class BatchedMujocoEnv(EnvBase):
+class BatchedMujocoEnv(CPUEnv):
     """A MuJoCo benchmark task with ``num_envs`` environments in one process.
 
     The physics is Gymnasium's to the bit (the same XML and ``mj_step``, the whole integration state
@@ -88,7 +119,8 @@ class BatchedMujocoEnv(EnvBase):
         num_envs: number of environments ``N``; the batch size is ``[N]``.
 
     Keyword Args:
-        seed: seed of the resets; drawn from torch's global generator if ``None``.
+        seed: seed of the resets; drawn from torch's global generator if ``None``, another one in
+            each worker of :mod:`multiprocessing`.
         max_steps: steps after which an episode is truncated; the task's horizon if ``None``.
         dtype: floating dtype of observation, action and reward.
         threads: threads that share the physics; the results do not depend on it. More than one
@@ -139,7 +171,7 @@ class BatchedMujocoEnv(EnvBase):
             task.action_low, task.action_high, (num_envs, task.action_dim), dtype=dtype
         )
         declare_specs(self, task.observation_dim, action_spec, dtype)
-        self.set_seed(int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed)
+        self.set_seed(drawn_seed() if seed is None else seed)
 
     @property
     def model(self) -> mujoco.MjModel:

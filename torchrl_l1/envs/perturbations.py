@@ -89,6 +89,7 @@ class ActionNoise(_UniformNoise):
         super().__init__(half_width, action_key)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._environment()  # refuses replay buffers
         return tensordict.set(self.key, self._noisy(tensordict.get(self.key)))
 
     def _reset(

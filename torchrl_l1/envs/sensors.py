@@ -45,14 +45,13 @@ class _Sensor(HeldDisturbance):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        reading, reset = tensordict_reset.get(self.key), tensordict.get("_reset", None)
+        reading, reset = tensordict_reset.get(self.key), self.resets(tensordict)
         self._restart(reading, reset)
         self.check_order(bool(self._state))
         seen = self._first(reading)
         if reset is not None:
             # The others' entries are those that they had, disturbed already.
-            chosen = reset.reshape(*reading.shape[:-1], -1).any(-1, keepdim=True)
-            seen = torch.where(chosen, seen, reading)
+            seen = torch.where(reset, seen, reading)
         return tensordict_reset.set(self.key, seen)
 
 
