@@ -96,6 +96,16 @@ def test_resumed_run_repeats_the_unbroken_one(l1: str, done: int) -> None:
     assert [result.metrics for result in resumed.iterate()] == rows[done:]
 
 
+def test_the_policy_that_labels_states_is_part_of_the_state() -> None:
+    first, second = make(), make(seed=1)
+    state = deepcopy(first.state_dict())
+    second.load_state_dict(state)
+    for one, other in zip(first.initial.parameters(), second.initial.parameters(), strict=True):
+        assert torch.equal(one, other)
+    del state["initial"]  # as in older checkpoints
+    make().load_state_dict(state)
+
+
 def test_policies_are_those_of_the_stages_so_far() -> None:
     algorithm = make()
     reached = []

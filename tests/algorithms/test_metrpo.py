@@ -40,6 +40,24 @@ def make(l1: L1Config | None = L1, seed: int = 0, **changes: object) -> METRPO:
     return METRPO("inverted_pendulum", tiny(**changes), l1=l1, seed=seed, horizon=25)
 
 
+def test_a_covariance_that_the_model_does_not_tell_is_refused() -> None:
+    few = ModelConfig(members=1, hidden=[8])
+    for covariance, settings, words in (
+        ("heads", {}, "set model.head=gaussian"),
+        ("disagreement", {"model": few}, "model.members is 1"),
+        ("disagreement", {"fit": FitConfig(elites=1)}, "fit.elites is 1"),
+    ):
+        config = tiny(**settings)
+        for l1 in (
+            L1Config.robust(0.04, covariance=covariance),
+            L1Config(0.04, estimator="weighted", covariance=covariance),
+        ):
+            with pytest.raises(ValueError, match=f"l1.covariance={covariance} .*{words}"):
+                METRPO("inverted_pendulum", config, l1)
+        METRPO("inverted_pendulum", config, L1Config(0.04, covariance=covariance))
+    METRPO("inverted_pendulum", tiny(model=few), L1Config.robust(0.04, covariance="sum"))
+
+
 def test_every_metric_is_documented_and_finite() -> None:
     results = [result.metrics for result in make().iterate()]
     assert set(results[0]) == set(METRICS)

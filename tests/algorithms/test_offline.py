@@ -150,6 +150,22 @@ def test_the_first_policy_acts_as_the_data_do() -> None:
     assert found[True] < 0.3 < 1 < found[False]
 
 
+@pytest.mark.parametrize("cloned", [True, False])
+def test_the_policy_sees_normalised_observations_where_settings_say_so(cloned: bool) -> None:
+    cloning = OfflineCloningConfig(enabled=cloned, max_epochs=1)
+    for normalize in (True, False):
+        algorithm = make(policy=PolicyConfig(hidden=[8], normalize=normalize), cloning=cloning)
+        next(algorithm.iterate())
+        mean, every = algorithm.policy.normalizer.mean, recorded()["observation"].flatten(0, 1)
+        if not normalize:
+            assert torch.equal(mean, torch.zeros(4))
+            continue
+        # Cloning keeps a tenth of the states for validation.
+        assert torch.allclose(mean, every.mean(0), atol=1e-6) == (not cloned)
+        assert ((mean - every.mean(0)).abs() < 0.2 * every.std(0)).all()
+    assert OfflineConfig().policy.normalize
+
+
 def test_data_may_be_a_buffer_or_several() -> None:
     data = recorded()
     buffer = ReplayBuffer(storage=LazyTensorStorage(len(data.reshape(-1))))

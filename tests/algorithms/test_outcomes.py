@@ -71,6 +71,14 @@ def test_what_is_learned_is_logged_and_finds_the_ends_in_the_data() -> None:
     assert results[-1]["termination_model/terminal"] == pytest.approx(share)
 
 
+def test_a_reward_of_another_shape_is_no_divergence() -> None:
+    algorithm = make()
+    algorithm.stops_on_divergence = False
+    algorithm.outcomes.reward = lambda observation, action, following: following
+    with pytest.raises(ValueError, match=r"^the reward function must return shape"):
+        next(algorithm.iterate())
+
+
 def test_one_may_be_learned_without_the_other() -> None:
     rewards = next(make(reward="learned", outcome_model=SMALL).iterate()).metrics
     ends = make(termination="learned", outcome_model=SMALL)

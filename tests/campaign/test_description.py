@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -20,7 +21,7 @@ from torchrl_l1.campaign.description import (
     read_campaign,
 )
 from torchrl_l1.campaign.jobs import LAUNCHERS, check_launcher, sweep
-from torchrl_l1.campaign.plan import PlannedRun, check_devices, plan
+from torchrl_l1.campaign.plan import PlannedRun, check_machine, plan
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.errors import RecipeError
 from torchrl_l1.experiment.recipes import available_campaigns, available_recipes
@@ -122,6 +123,11 @@ def test_a_users_recipe_is_found_beside_the_campaign(write: Any, tmp_path: Path)
         (RUNS + "evaluation: []", "unknown key 'evaluation'. Did you mean evaluations"),
         (RUNS + RUNS, "stands twice"),
         ("runs: [{overrides: []}]", r"runs\[0\]: recipe is missing"),
+        ("runs: [{recipe: 3}]", r"runs\[0\]: recipe must be the name of a recipe .* got 3"),
+        ("runs: [{recipe: }]", "recipe must be the name of a recipe .* got None"),
+        ("runs: [{recipe: [a]}]", r"recipe must be the name of a recipe .* got \['a'\]"),
+        ("runs: [{recipe: offline/half_cheetah, overrides: [reward=learned]}]",
+         "offline learning goes by rewards"),
         ("runs: [{recipe: metrpo/pendulum}]", "unknown recipe 'metrpo/pendulum'"),
         ("runs: [{recipe: mine2.yaml}]", "mine2.yaml does not exist"),
         (RUNS.replace("matrix", "matrices"), "Did you mean matrix"),
@@ -129,6 +135,8 @@ def test_a_users_recipe_is_found_beside_the_campaign(write: Any, tmp_path: Path)
         (RUNS.replace("[0, 1]", "[]"), "matrix.seed must be a list of values"),
         (RUNS.replace("[0, 1]", "[0, 0]"), "names a value twice: 0, 0"),
         (RUNS.replace("[0, 1]", "[many]"), "seed"),
+        (RUNS.replace("[0, 1]", "['00', 0]"), "matrix.seed must hold whole numbers"),
+        (RUNS.replace("[0, 1]", "[true]"), "matrix.seed must hold whole numbers"),
         (RUNS.replace("[0, 1]", "[010]"), "line 1, .*: 010 means 8 in YAML; write 8, or '010'"),
         (RUNS.replace("[0, 1]", "[1:30]"), "1:30 means 90 in YAML"),
         (RUNS + "evaluations: [{name: e, bias: [-01]}]", "-01 means -1 in YAML"),
@@ -150,6 +158,9 @@ def test_a_users_recipe_is_found_beside_the_campaign(write: Any, tmp_path: Path)
         (RUNS.replace("matrix", "overrides: [model.activation=reluu], matrix"), "activation"),
         (RUNS.replace("matrix", "overrides: [policy.std=0], matrix"), "policy.std"),
         (RUNS.replace("matrix", "overrides: [threads=0], matrix"), "threads"),
+        (RUNS.replace("matrix", "overrides: [fit.elites=9], matrix"), "elites"),
+        (RUNS.replace("matrix", "overrides: ['fit.weight_decay=[0.1]'], matrix"), "weight_decay"),
+        (RUNS.replace("matrix", "overrides: ['reward=nomod:foo'], matrix"), "nomod"),
         (RUNS.replace("matrix", "overrides: [perturbation.action_noise=-1], matrix"), "noise"),
         (RUNS.replace("matrix", "overrides: [device=gpu], matrix"), "device must be 'cpu'"),
         (RUNS + RUNS.replace("runs: [", "- ").replace("]\n", "\n"), "not valid YAML"),
@@ -166,6 +177,7 @@ def test_a_users_recipe_is_found_beside_the_campaign(write: Any, tmp_path: Path)
         (RUNS + "evaluations: [{name: e, policy: [greedy]}]", "unknown policy 'greedy'"),
         (RUNS + "evaluations: [{name: e, episodes: 0}]", "episodes must be a whole number from 1"),
         (RUNS + "evaluations: [{name: e, bias: [high]}]", "bias holds 'high'"),
+        (RUNS + "evaluations: [{name: e, bias: [true]}]", "bias holds True"),
         (RUNS + "evaluations: [{name: e, gain: [.inf]}]", "gain must be finite"),
         (RUNS + "evaluations: [{name: e, epsilon: .inf}]", "epsilon must be finite and not"),
         (RUNS + "evaluations: [{name: e, epsilon: [1, -1]}]", "epsilon must be finite and not"),
@@ -219,7 +231,26 @@ def test_device_is_that_of_the_machine_that_trains(
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     campaign = read_campaign(write(RUNS), ["device=cuda"])
     with pytest.raises(CampaignError, match=r"runs\[0\]: device=cuda .* no CUDA device"):
-        check_devices(campaign, plan(campaign, tmp_path))
+        check_machine(campaign, plan(campaign, tmp_path))
+
+
+def test_a_dataset_must_be_there_for_what_is_to_be_trained(write: Any, tmp_path: Path) -> None:
+    text = "runs: [{recipe: offline/inverted_pendulum, overrides: [dataset=DATA]}]"
+    campaign = read_campaign(write(text.replace("DATA", "nothere.npz")))
+    (run,) = plan(campaign, tmp_path)
+    with pytest.raises(CampaignError, match=r"runs\[0\]: nothere\.npz: no such dataset"):
+        check_machine(campaign, [run])
+    run.directory.path.mkdir(parents=True)
+    run.directory.checkpoint_file.write_text("holds the data")
+    check_machine(campaign, [run])
+    minari = read_campaign(write(text.replace("DATA", "hopper/medium-v0")))
+    check_machine(minari, plan(minari, tmp_path / "minari"))
+
+
+def test_planning_draws_no_random_numbers(write: Any, tmp_path: Path) -> None:
+    before = torch.get_rng_state()
+    plan(read_campaign(write(RUNS)), tmp_path)
+    assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_no_run_of_the_switching_campaign_is_trained_twice(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
@@ -226,3 +227,17 @@ def test_a_damaged_table_is_made_again_and_not_reported(
     file.write_text("")
     evaluate_run(str(directory), settings.name, settings.of_a_run())
     assert seen() == (True, True) and file.read_text() == whole
+
+
+def test_a_kill_leaves_no_table_of_older_settings(
+    tiny_recipe: Callable[..., DictConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory = run(tiny_recipe("l1=off", "outer_iterations=1"))
+    settings = EvaluationSettings("e", matrix={"l1": ["off"]}, episodes=2)
+    evaluate_run(str(directory), "e", settings.of_a_run())
+    assert find_readable_runs([directory]).runs[0].evaluations
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(evaluation, "write_table", Mock(side_effect=KeyboardInterrupt))
+        evaluate_run(str(directory), "e", replace(settings, seed=1).of_a_run())
+    found = find_readable_runs([directory])
+    assert not found.runs[0].evaluations and not found.errors

@@ -149,6 +149,17 @@ def test_signal_ends_all_processes(
     assert signal.getsignal(number) == before
 
 
+def test_an_ignored_signal_ends_nothing(make_job: MakeJob) -> None:
+    """As SIGHUP is with nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        jobs = [make_job(f"kill -HUP {os.getpid()}"), make_job("true")]
+        assert workers(1).work(jobs) == []
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
 def test_environment_has_one_thread(make_job: MakeJob) -> None:
     job = make_job("echo $OMP_NUM_THREADS $MKL_NUM_THREADS")
     assert workers(1).work([job]) == []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -105,6 +106,33 @@ def test_kept_checkpoints_that_cannot_be_used_are_a_line(tiny_recipe: Recipe) ->
     file.write_bytes((other / "checkpoints" / "after_2.pt").read_bytes())
     with pytest.raises(RunDirectoryError, match="another configuration: seed: 1 there, 0 now"):
         load_run(file)
+    file.write_bytes(content)
+    state = read_checkpoint(file)
+    del state["algorithm"]["policy"]
+    torch.save(state, file)
+    with pytest.raises(RunDirectoryError, match=r"after_2\.pt does not fit the run: 'policy'"):
+        load_run(file)
+
+
+def test_checkpoints_of_other_iterations_are_no_seeds_of_one_training(
+    tiny_recipe: Recipe, capsys: pytest.CaptureFixture[str]
+) -> None:
+    keep = ("checkpoint.every=1", "checkpoint.best=true")
+    first = run(tiny_recipe(*keep)) / "checkpoints"
+    second = run(tiny_recipe(f"run_dir={first.parent.with_name('2')}", "seed=1", *keep))
+    second /= "checkpoints"
+    files = [str(first / "after_2.pt"), str(second / "after_1.pt")]
+    with pytest.raises(SystemExit):
+        main(["evaluate", *files, "--episodes", "1", "--l1", "off"])
+    line = f"{files[0]} is of 2 iterations and {files[1]} of 1; let both get equally far"
+    assert line in capsys.readouterr().err
+    # The best may come at any time.
+    (first / "best.pt").unlink()
+    (second / "best.pt").unlink()
+    shutil.copy(files[0], first / "best.pt")
+    shutil.copy(files[1], second / "best.pt")
+    files = [str(first / "best.pt"), str(second / "best.pt")]
+    main(["evaluate", *files, "--episodes", "1", "--l1", "off"])
 
 
 def test_nothing_is_kept_through_a_link(tiny_recipe: Recipe, tmp_path: Path) -> None:

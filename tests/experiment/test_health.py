@@ -20,11 +20,13 @@ from torchrl_l1.algorithms.algorithm import Algorithm, Diverged
 from torchrl_l1.algorithms.model_learning import ModelLearning
 from torchrl_l1.algorithms.policy_improvement import PolicyImprovement
 from torchrl_l1.envs.simulation import TaskSimulation
+from torchrl_l1.experiment import run_directory
 from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.run_directory import RunDirectory
 from torchrl_l1.experiment.signals import RESUME_ME, orderly_end
+from torchrl_l1.objectives import NonFiniteAdvantages
 from torchrl_l1.objectives.gaussian_trpo import _GaussianProblem
 from torchrl_l1.report import report
 
@@ -90,7 +92,9 @@ def test_what_is_not_finite_in_fit_and_policy_step_is_named(
 
         def spoilt(self: Any, *arguments: Any) -> Any:
             if kind == "advantage":
-                raise ValueError("TRPO: non-finite advantages; check rewards and value estimates")
+                raise NonFiniteAdvantages(
+                    "TRPO: non-finite advantages; check rewards and value estimates"
+                )
             found = step(self, *arguments)
             found.report.kl = math.nan
             return found
@@ -103,6 +107,39 @@ def test_what_is_not_finite_in_fit_and_policy_step_is_named(
     run(tiny_recipe("resume=true", "on_divergence=warn"))
     assert [float(row["diverged"]) > 0 for row in rows(tmp_path / "run")] == [True, True]
     assert words.split(";")[0].split("\\")[0] in (tmp_path / "run" / "diverged.txt").read_text()
+
+
+def test_a_kill_loses_no_word_of_what_has_diverged(
+    tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It comes after the last row of the metrics, or after the checkpoint that they are of."""
+    step, write = PolicyImprovement.step, run_directory.write_atomically
+    folder = tmp_path / "run"
+
+    def spoilt(self: Any, *arguments: Any) -> Any:
+        found = step(self, *arguments)
+        found.report.kl = math.nan
+        return found
+
+    def run_until(name: str, *overrides: str) -> None:
+        def killed(file: Path, *arguments: Any) -> None:
+            write(file, *arguments)
+            if file.name == name:
+                raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(run_directory, "write_atomically", killed)
+            run(tiny_recipe("on_divergence=warn", "checkpoint.every=1", *overrides))
+
+    monkeypatch.setattr(PolicyImprovement, "step", spoilt)
+    run_until("metrics.csv")
+    assert "iteration 0, TRPO: trpo/kl is nan" in (folder / "diverged.txt").read_text()
+    assert (folder / "checkpoints/after_1.pt").exists()
+    for number in (0, 1):
+        (folder / "diverged.txt").unlink()
+        run_until("checkpoint.pt" if number == 0 else "nothing", "resume=true")
+        words = f"training diverged in iteration {number}\n"
+        assert (folder / "diverged.txt").read_text() == words
 
 
 def test_plans_that_all_diverge_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,6 +217,20 @@ def test_a_second_signal_is_not_caught() -> None:
         finally:
             seen.append(signal.getsignal(signal.SIGTERM))
     assert seen == [signal.SIG_DFL]
+
+
+def test_a_signal_that_is_ignored_stays_so_after_another() -> None:
+    """With nohup a run that ends by SIGTERM closes its loggers though the terminal is closed."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with pytest.raises(SystemExit), orderly_end():
+            try:
+                signal.raise_signal(signal.SIGTERM)
+            finally:
+                found = signal.getsignal(signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert found is signal.SIG_IGN
 
 
 def test_a_warning_lets_the_iteration_be_finished(

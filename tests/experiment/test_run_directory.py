@@ -9,8 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_l1.experiment.errors import RunDirectoryInUse
+from torchrl_l1.experiment.errors import RunDirectoryError, RunDirectoryInUse
 from torchrl_l1.experiment.files import locked
+from torchrl_l1.experiment.launch import compose
+from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.run_directory import RunDirectory
 
 HOLD = """
@@ -97,3 +99,11 @@ def test_data_that_have_changed_since_a_run_began_are_known(tmp_path: Path) -> N
     assert run.changed_files(config) == []
     data.unlink()
     assert run.changed_files(config, data=True) == []
+
+
+def test_a_directory_is_refused_before_any_data_are_read(tmp_path: Path) -> None:
+    (tmp_path / "letter.txt").write_text("mine")
+    overrides = ["dataset=nowhere.npz", f"run_dir={tmp_path}", "wandb.mode=disabled"]
+    with pytest.raises(RunDirectoryError, match="is not empty and holds no run"):
+        run(compose("offline/inverted_pendulum", overrides))
+    assert [file.name for file in tmp_path.iterdir()] == ["letter.txt"]

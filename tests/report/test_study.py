@@ -104,6 +104,19 @@ def test_equal_runs_share_their_evaluations(write_run: WriteRun, tmp_path: Path)
     assert sorted(run.path.name for run in study.duplicates) == ["b", "c", "d", "e"]
 
 
+@pytest.mark.parametrize(("seed", "episodes"), [(0, 25), (1, 25), (0, 8)])
+def test_evaluations_from_other_resets_are_not_merged(
+    seed: int, episodes: int, write_run: WriteRun, tmp_path: Path
+) -> None:
+    row = {"l1": "off", "noise": "none", "gain": 1.0, "policy": "stochastic", "return_mean": 1.0}
+    for name, bias, *drawn in (("a", 0.0, 0, 25), ("b", 1.0, seed, episodes)):
+        tests = {"mine": [row | {"bias": bias, "episodes": drawn[1]}]}
+        path = write_run([1, 2], name=name, iterations=2, evaluations=tests)
+        (path / "evaluations/mine.yaml").write_text(f"{{iterations: 2, seed: {drawn[0]}}}")
+    (run,) = Study(find_runs([tmp_path])).runs
+    assert len(run.evaluations["mine"]) == 1 + ((seed, episodes) == (0, 25))
+
+
 def test_every_task_has_a_main_cell(write_run: WriteRun, tmp_path: Path) -> None:
     # Most L1 runs have an epsilon that no run with the main label has.
     for noise in ("none", "action", "observation"):

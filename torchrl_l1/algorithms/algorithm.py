@@ -18,7 +18,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torchrl_l1.algorithms.collection import RETURN_METRICS, Collection, seed_streams
-from torchrl_l1.algorithms.config import ModelConfig, episode_length
+from torchrl_l1.algorithms.config import ModelConfig, check_covariance, episode_length
 from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.algorithms.model_learning import FIT_METRICS, ModelLearning, fit_metrics
 from torchrl_l1.algorithms.outcomes import OUTCOME_METRICS, OutcomeConfig, Outcomes
@@ -200,6 +200,7 @@ class Algorithm(ABC):
         search_path: Sequence[str] = (),
     ) -> None:
         check_optional_count("horizon", horizon)
+        check_covariance(l1, config.model, config.fit.elites)
         self.config, self.l1, self.seed = config, l1, seed
         self.device = resolve_device(device)
         self.on_phase = on_phase or (lambda phase: None)

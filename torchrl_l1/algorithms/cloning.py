@@ -72,6 +72,8 @@ class Cloning:
         config: how it is fitted.
         half_range: half the range of the actions, one number or one for each entry.
         capacity: states that there is room for.
+        normalize: whether each fit takes the statistics of the policy's inputs from the states
+            that it trains on.
     """
 
     def __init__(
@@ -80,8 +82,10 @@ class Cloning:
         config: CloningSettings,
         half_range: float | Tensor,
         capacity: int,
+        normalize: bool = True,
     ) -> None:
         self.policy, self.config, self.half_range = policy, config, half_range
+        self.normalize = normalize
         self.data = TrainingData(capacity, config.batch_size, config.validation_fraction)
         self.buffer = self.data.buffer
 
@@ -114,7 +118,8 @@ class Cloning:
                 self.buffer, "clone", "states", "cloning.validation_fraction"
             )
         )
-        policy.normalizer.fit(train["observation"])
+        if self.normalize:
+            policy.normalizer.fit(train["observation"])
         optimizer = torch.optim.Adam(policy.mean.parameters(), lr=config.learning_rate, fused=True)
         best, best_loss, stale = deepcopy(policy.mean.state_dict()), torch.inf, 0
         epoch, running = 0, 0.0

@@ -14,6 +14,7 @@ from torchrl_l1.checks import (
     check_positive,
     check_widths,
 )
+from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import HEADS, MODEL_FORMS, EnsembleDynamics
 from torchrl_l1.dynamics.ensemble import ACTIVATIONS
 from torchrl_l1.planning import TrajectorySampler, check_sampling, resolve_compilation
@@ -75,6 +76,33 @@ def check_planning(settings: PlanSettings, optimizer: str, horizon: int) -> None
     resolve_compilation(
         settings.compile_plans, propagation=settings.propagation, name="compile_plans"
     )
+
+
+def check_covariance(l1: L1Config | None, model: ModelConfig, elites: int | None) -> None:
+    """Refuse a covariance of residuals that a model does not tell.
+
+    Args:
+        l1: the controller; ``None`` for none.
+        model: settings of the model.
+        elites: how many of its members count; all of them if ``None``.
+
+    Raises:
+        ValueError: naming the setting of the model.
+    """
+    if l1 is None or (l1.filter != "kalman" and l1.estimator != "weighted"):
+        return
+    if l1.covariance == "heads" and model.head != "gaussian":
+        raise ValueError(
+            "l1.covariance=heads needs members that predict a distribution: set "
+            "model.head=gaussian, or l1.covariance=residuals"
+        )
+    counts = {"model.members": model.members, "fit.elites": elites or model.members}
+    for name, count in counts.items():
+        if l1.covariance == "disagreement" and count < 2:
+            raise ValueError(
+                f"l1.covariance=disagreement needs two members or more, {name} is {count}; raise "
+                "it, or set l1.covariance=residuals"
+            )
 
 
 def episode_length(asked: int | None, horizon: int) -> int:

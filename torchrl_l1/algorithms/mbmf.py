@@ -270,6 +270,7 @@ class MBMF(Algorithm):
         """Everything needed to continue, as plain tensors and numbers."""
         return {
             **super().state_dict(),
+            "initial": self.initial.state_dict(),
             "clone": self.clone.state_dict(),
             "policy": self.policy.state_dict(),
             "cloning": self.cloning.state_dict(),
@@ -279,6 +280,8 @@ class MBMF(Algorithm):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
         super().load_state_dict(state)
+        # Older checkpoints lack it; it is drawn from the seed.
+        self.initial.load_state_dict(state.get("initial", self.initial.state_dict()))
         self.clone.load_state_dict(state["clone"])
         self.policy.load_state_dict(state["policy"])
         self.cloning.load_state_dict(state["cloning"])

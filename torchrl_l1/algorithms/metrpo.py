@@ -33,6 +33,7 @@ from torchrl_l1.algorithms.policy_improvement import (
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics.network import model_precision
 from torchrl_l1.envs import AnyTask, Perturbation
+from torchrl_l1.objectives import NonFiniteAdvantages
 
 
 class METRPO(Algorithm):
@@ -125,7 +126,7 @@ class METRPO(Algorithm):
                     self.on_phase(f"TRPO {step + 1}/{config.trpo_iterations}")
                     try:
                         steps.append(self.improvement.step(self.learning.buffer))
-                    except ValueError as error:
+                    except NonFiniteAdvantages as error:
                         self.diverged(str(error), "imagined_horizon, discount and policy.std")
                 improvement = policy_metrics(steps)
                 self._check_finite(improvement)

@@ -48,6 +48,7 @@ from torchrl_l1.dynamics import read_transitions
 from torchrl_l1.dynamics.network import model_precision
 from torchrl_l1.dynamics.transitions import Data, check_time_step
 from torchrl_l1.envs import AnyTask, Perturbation, action_bounds
+from torchrl_l1.objectives import NonFiniteAdvantages
 
 OFFLINE_METRICS: dict[str, str] = {
     "data/transitions": "Transitions of the dataset.",
@@ -252,7 +253,7 @@ class Offline(Algorithm):
                     self.on_phase(f"TRPO {step + 1}/{config.trpo_iterations}")
                     try:
                         steps.append(self.improvement.step(self.learning.buffer))
-                    except ValueError as error:
+                    except NonFiniteAdvantages as error:
                         self.diverged(str(error), "penalty_coefficient, discount and policy.std")
                 self._check_weights("policy", self.policy)
 
@@ -281,13 +282,14 @@ class Offline(Algorithm):
     def _first_policy(self) -> dict[str, float]:
         """The phase in which the policy is fitted to the data's actions, if settings say so."""
         config, data = self.config.cloning, self.learning.buffer[:]
+        normalize = self.config.policy.normalize
         with self.phase("clone"):
-            if self.config.policy.normalize:
-                self.policy.normalizer.fit(data["observation"].to(self.device))
             if not config.enabled:
+                if normalize:
+                    self.policy.normalizer.fit(data["observation"].to(self.device))
                 return {"clone/validation_loss": 0.0}
             low, high = action_bounds(self.task)
-            cloning = Cloning(self.policy, config, (high - low) / 2, len(data))
+            cloning = Cloning(self.policy, config, (high - low) / 2, len(data), normalize)
             cloning.store(data["observation"], data["action"])
             report = cloning.fit(lambda epoch: self.on_phase(f"cloning, epoch {epoch}"))
             self._check_weights("policy", self.policy)

@@ -104,7 +104,8 @@ class OfflineConfig:
         discount: gamma.
         gae_lambda: lambda of the generalized advantage estimate.
         model: see :class:`ModelConfig`.
-        policy: see :class:`PolicyConfig`.
+        policy: see :class:`PolicyConfig`. With ``normalize``, which is on here, the statistics are
+            those of the states that cloning trains on, or of all data without cloning; they stay.
         fit: see :class:`~torchrl_l1.dynamics.FitConfig`. There is one fit only.
         cloning: see :class:`OfflineCloningConfig`.
         trpo: see :class:`~torchrl_l1.objectives.TRPOConfig`.
@@ -130,7 +131,7 @@ class OfflineConfig:
     discount: float = 0.99
     gae_lambda: float = 0.95
     model: ModelConfig = field(default_factory=ModelConfig)
-    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    policy: PolicyConfig = field(default_factory=lambda: PolicyConfig(normalize=True))
     fit: FitConfig = field(default_factory=FitConfig)
     cloning: OfflineCloningConfig = field(default_factory=OfflineCloningConfig)
     trpo: TRPOConfig = field(default_factory=TRPOConfig)

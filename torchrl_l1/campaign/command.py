@@ -17,7 +17,7 @@ from torchrl_l1.campaign.description import (
     read_campaign,
 )
 from torchrl_l1.campaign.jobs import check_launcher, elsewhere, launch_runs, work_on_runs
-from torchrl_l1.campaign.plan import check_devices, plan
+from torchrl_l1.campaign.plan import check_machine, plan
 from torchrl_l1.campaign.progress import overview
 from torchrl_l1.campaign.reuse import copy_run, find_reusable
 from torchrl_l1.campaign.workers import Stopped, available_cores
@@ -54,7 +54,7 @@ def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> N
             "another --output"
         )
     _check_owner(output, campaign)
-    # Runs that are reused need no device, so devices are checked once these are known.
+    # Runs that are reused need no device and no dataset, which are checked once these are known.
     runs = plan(campaign, output, trusted=options.trust)
     begun = [run for run in runs if run.directory.config_file.exists()]
     changed = {n for run in begun for n in run.directory.changed_files(run.settings(), data=True)}
@@ -66,7 +66,7 @@ def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> N
         )
     reused = find_reusable(runs, output, [Path(folder) for folder in options.reuse])
     if not (options.launcher and elsewhere(options.launcher)):
-        check_devices(campaign, [run for run in runs if run.directory.path not in reused])
+        check_machine(campaign, [run for run in runs if run.directory.path not in reused])
     if options.list:
         print(overview(runs, reused))
         return

@@ -111,6 +111,8 @@ _NAME_OF_CODE = re.compile(r"[A-Za-z0-9_.+:/-]{1,200}")
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:[./@-][A-Za-z0-9_]+)*")
 # Of a campaign, whose default is that of a user's file.
 _NAME = re.compile(r"[\w+][\w.+=, -]{0,99}")
+# What a value of a matrix may be.
+_PLAIN_VALUES = (str, bool, int, float)
 _RESERVED = ("run_dir", "resume")
 
 
@@ -133,13 +135,17 @@ class RunMatrix:
     matrix: dict[str, list[Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _check_list("overrides", self.overrides, str)
+        if not isinstance(self.recipe, str):
+            raise CampaignError(
+                f"recipe must be the name of a recipe or a YAML file, got {self.recipe!r}"
+            )
+        _check_list("overrides", self.overrides, (str,))
         if not isinstance(self.matrix, dict):
             raise CampaignError(f"matrix must map keys to lists of values, got {self.matrix!r}")
         for key, values in self.matrix.items():
             if not _KEY.fullmatch(str(key)) or len(str(key)) > 100:
                 raise CampaignError(f"matrix: {key!r} is no key of a recipe")
-            _check_list(f"matrix.{key}", values, (str, int, float), filled=True)
+            _check_list(f"matrix.{key}", values, _PLAIN_VALUES, filled=True)
             texts = [value_text(value) for value in values]
             for text in texts:
                 if not (_NAME_OF_CODE if key in NAMING_KEYS else _PLAIN).fullmatch(text):
@@ -158,6 +164,8 @@ class RunMatrix:
                     f"{key} is set by overrides and by the matrix; leave one of them out"
                 )
         seeds = {"seed": self.matrix.get("seed", [0])}
+        if any(not isinstance(seed, int) or isinstance(seed, bool) for seed in seeds["seed"]):
+            raise CampaignError(f"matrix.seed must hold whole numbers, got {seeds['seed']!r}")
         self.matrix = {k: v for k, v in self.matrix.items() if k != "seed"} | seeds
 
 
@@ -191,7 +199,7 @@ class EvaluationSettings:
         if not isinstance(self.where, dict):
             raise CampaignError(f"where must map keys to lists of values, got {self.where!r}")
         for key, values in self.where.items():
-            _check_list(f"where.{key}", values, (str, int, float), filled=True)
+            _check_list(f"where.{key}", values, _PLAIN_VALUES, filled=True)
         every = axes()
         for key in self.matrix:
             if key not in [axis.name for axis in every]:
@@ -305,7 +313,7 @@ def _axis_values(axis: Axis, given: Mapping[str, Any]) -> list[Any]:
     if axis.kind is float:
         _check_list(axis.name, values, (int, float), filled=True)
         return [float(value) for value in values]
-    _check_list(axis.name, values, str, filled=bool(axis.values))
+    _check_list(axis.name, values, (str,), filled=bool(axis.values))
     return list(values)
 
 
@@ -317,13 +325,12 @@ def _numbers(key: str, value: Any) -> list[float]:
     return [float(one) for one in values]
 
 
-def _check_list(
-    key: str, values: Any, kinds: type | tuple[type, ...], filled: bool = False
-) -> None:
+def _check_list(key: str, values: Any, kinds: tuple[type, ...], filled: bool = False) -> None:
     if not isinstance(values, list) or (filled and not values):
         raise CampaignError(f"{key} must be a list{' of values' * filled}, got {values!r}")
     for value in values:
-        if not isinstance(value, kinds):
+        # To Python a truth value is a whole number, too.
+        if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
             raise CampaignError(f"{key} holds {value!r}, which is no plain value of its kind")
 
 

@@ -92,7 +92,8 @@ def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
     described = table.with_suffix(".yaml")
     singly = episodes_file(table)
     singly.parent.mkdir(parents=True, exist_ok=True)
-    # In this order: no kill leaves a table beside the settings of another one.
+    # In this order: no kill leaves a table beside the settings of another one, or beside none.
+    table.unlink(missing_ok=True)
     described.unlink(missing_ok=True)
     write_table(singly, episodes)
     write_table(table, rows)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+from torch.random import fork_rng
 
 from torchrl_l1.algorithms.algorithm import resolve_device
 from torchrl_l1.algorithms.config import episode_length
@@ -21,9 +22,15 @@ from torchrl_l1.campaign.description import (
     RunMatrix,
     value_text,
 )
-from torchrl_l1.compilation import check_mode
 from torchrl_l1.envs import AnyTask
-from torchrl_l1.experiment.errors import USER_ERRORS, RunDirectoryError, message
+from torchrl_l1.experiment.checkpoints import single_precision
+from torchrl_l1.experiment.datasets import check_dataset
+from torchrl_l1.experiment.errors import (
+    USER_ERRORS,
+    RunDirectoryError,
+    fitting_into_memory,
+    message,
+)
 from torchrl_l1.experiment.evaluate import check_controllers, check_plants
 from torchrl_l1.experiment.files import bounded, path_text
 from torchrl_l1.experiment.l1_options import check_tested
@@ -31,7 +38,7 @@ from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.experiment.recipes import group_setting
 from torchrl_l1.experiment.run_directory import RunDirectory
-from torchrl_l1.experiment.settings import SCHEMAS, RunSettings, check_known, l1_config
+from torchrl_l1.experiment.settings import SCHEMAS, RunSettings, check_known
 from torchrl_l1.experiment.tracking import check_loggers
 
 
@@ -216,23 +223,26 @@ def _check(config: DictConfig) -> None:
     check_known(config)
     recipe = OmegaConf.to_object(config)
     assert isinstance(recipe, RunSettings)
-    l1_config(recipe.l1, recipe.real_task())
-    check_mode(recipe.l1.compile, "l1.compile")
     check_loggers(recipe)
+    # What is drawn for weights is of no use; the global numbers go on as if nothing had been.
+    with fork_rng(devices=[]), single_precision(), fitting_into_memory(recipe.recipe):
+        recipe.build_on_cpu()
 
 
-def check_devices(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
+def check_machine(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
     """Make sure that this machine can train the runs that are not finished.
 
     Raises:
-        CampaignError: if a device is not there.
+        CampaignError: if a device or a dataset is not there.
     """
     for run in runs:
         if run.finished():
-            continue  # evaluations need no other device than the CPU
+            continue  # evaluations need no other device than the CPU, and no dataset
         try:
             resolve_device(run.config.device)
-        except ValueError as error:
+            if "dataset" in run.config and not run.directory.checkpoint_file.exists():
+                check_dataset(run.config.dataset)
+        except (FileNotFoundError, ValueError) as error:
             raise CampaignError(f"{campaign.file}: runs[{run.matrix}]: {error}") from error
 
 

@@ -136,7 +136,8 @@ class Workers:
             the jobs that ended badly; the others went on.
 
         Raises:
-            Stopped: after SIGINT, SIGTERM, SIGHUP or SIGUSR1, once every process has ended.
+            Stopped: after SIGINT, SIGTERM, SIGHUP or SIGUSR1, unless it is ignored, once every
+                process has ended.
         """
         self._queue.extend(jobs)
         with self._signals():
@@ -220,7 +221,12 @@ class Workers:
         def note(signal_number: int, frame: FrameType | None) -> None:
             self._stop = signal_number
 
-        before = {number: signal.signal(number, note) for number in _STOPPING}
+        before = {
+            number: signal.signal(number, note)
+            for number in _STOPPING
+            # What is ignored, as by nohup, stays so.
+            if signal.getsignal(number) is not signal.SIG_IGN
+        }
         try:
             yield
         finally:

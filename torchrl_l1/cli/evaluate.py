@@ -189,7 +189,10 @@ def _poses(trained: TrainedRun, cell: Condition, steps: int, seed: int) -> np.nd
 
 
 def _check_one_study(runs: Sequence[TrainedRun]) -> None:
-    """Runs may differ in their seed and in nothing that matters."""
+    """Runs may differ in their seed and in nothing that matters.
+
+    The best of their checkpoints may be of any iteration.
+    """
 
     def settings(trained: TrainedRun) -> RunSettings:
         return replace(
@@ -221,6 +224,13 @@ def _check_one_study(runs: Sequence[TrainedRun]) -> None:
             raise ValueError(
                 f"{runs[0].path} and {trained.path} differ in more than their seed; evaluate them "
                 "one at a time"
+            )
+        iterations = [one.algorithm.iteration for one in (runs[0], trained)]
+        best = {runs[0].checkpoint, trained.checkpoint} == {"best"}
+        if len(set(iterations)) > 1 and not best:
+            raise ValueError(
+                f"{runs[0].name} is of {iterations[0]} iterations and {trained.name} of "
+                f"{iterations[1]}; let both get equally far, or evaluate them one at a time"
             )
     seeds: dict[int, TrainedRun] = {}
     for trained in runs:

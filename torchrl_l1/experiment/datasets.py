@@ -49,26 +49,31 @@ def read_dataset(source: str, columns: DatasetColumns | None = None) -> TensorDi
         ValueError: if it cannot be read, is of a kind that is not known, or has no use for what
             ``columns`` name.
     """
+    check_dataset(source)
     columns = columns or DatasetColumns()
     path = Path(source)
     try:
-        if not source:
-            raise ValueError("offline learning needs a dataset: set dataset=...")
         if path.is_dir():
             data = _folder(path)
         elif path.suffix in _TABLES and path.is_file():
             return _TABLES[path.suffix](path, columns)
         elif path.is_file():
             data = _file(path, columns)
-        elif is_minari_name(source):
-            data = read_minari(source)
         else:
-            raise FileNotFoundError(
-                f"{source}: no such dataset; torchrl-l1 dataset RUN_DIR {source} makes one"
-            )
+            data = read_minari(source)
     except (ModuleNotFoundError, TypeError) as error:
         raise ValueError(str(error)) from error
     return _named(source, data, columns)
+
+
+def check_dataset(source: str) -> None:
+    """Raise the error of :func:`read_dataset` for what is not there; names of Minari's pass."""
+    if not source:
+        raise ValueError("offline learning needs a dataset: set dataset=...")
+    if not (Path(source).is_dir() or Path(source).is_file() or is_minari_name(source)):
+        raise FileNotFoundError(
+            f"{source}: no such dataset; torchrl-l1 dataset RUN_DIR {source} makes one"
+        )
 
 
 def is_minari_name(text: str) -> bool:

@@ -105,14 +105,12 @@ def load_run(path: str | Path, *, last: bool = False) -> TrainedRun:
     if checkpoint is None:
         raise RunDirectoryError(f"the run in {path} has no checkpoint yet; let it finish first")
     recipe = _recipe(directory)
-    here: dict[str, Any] = {"device": "cpu"}
-    if hasattr(recipe, "compile_plans"):
-        here["compile_plans"] = False  # as "auto" decides on the CPU
     state = checkpoint["algorithm"]
     with single_precision():
         with fitting_into_memory(str(path)):
-            algorithm = replace(recipe, **here).build()
-        load_state(algorithm, {**state, "buffer": {}}, directory.checkpoint_file)
+            algorithm = recipe.build_on_cpu()
+        file = directory.checkpoint_file if kept is None else Path(path)
+        load_state(algorithm, {**state, "buffer": {}}, file)
         _measure_residuals(algorithm, state.get("buffer", {}))
     return TrainedRun(directory.path, recipe, algorithm, Path(path).stem if kept else "")
 

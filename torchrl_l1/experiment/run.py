@@ -22,7 +22,7 @@ from torchrl_l1.experiment.checkpoints import (
     single_precision,
 )
 from torchrl_l1.experiment.errors import RunDirectoryError, fitting_into_memory
-from torchrl_l1.experiment.files import refuse_link, write_atomically
+from torchrl_l1.experiment.files import refuse_link
 from torchrl_l1.experiment.provenance import versions
 from torchrl_l1.experiment.run_directory import RunDirectory, read_config
 from torchrl_l1.experiment.settings import RunSettings, check_known, schema_of
@@ -65,6 +65,7 @@ def run(config: DictConfig) -> Path:
         directory = RunDirectory(recipe.run_dir)
         for folder in ("wandb", "tensorboard", "checkpoints"):
             refuse_link(directory.path / folder)
+        directory.check_open(settings, recipe.resume)
         if not (recipe.resume and directory.checkpoint_file.exists()):
             algorithm.prepare()
         with directory.open(settings, recipe.resume), fitting_into_memory(recipe.recipe):
@@ -110,11 +111,12 @@ def _run(
         progress.update(len(rows))
         if directory.last_is_good:
             # A kill has come between the checkpoint and the files made from it, or they changed.
+            directory.tell_divergence(rows)
+            keep_checkpoints(directory.checkpoint_file, recipe.checkpoint, rows, progress.write)
             restored = directory.restore_results(algorithm.weights(), rows, timings)
             if restored:
                 names = ", ".join(restored)
                 progress.write(f"{directory.path}: written again from the checkpoint: {names}")
-            keep_checkpoints(directory.checkpoint_file, recipe.checkpoint, rows, progress.write)
         if len(rows) >= recipe.outer_iterations and not lacks(recipe, directory.path, rows):
             progress.write(f"{directory.path} is complete: nothing to do")
             return
@@ -124,8 +126,7 @@ def _run(
     with trackers(recipe, directory.path, config, rows, timings, progress.write) as loggers:
         try:
             for result in algorithm.iterate():
-                _save(result, algorithm, settings, directory, rows, timings)
-                keep_checkpoints(directory.checkpoint_file, recipe.checkpoint, rows)
+                _save(result, algorithm, recipe, settings, directory, rows, timings)
                 for logger in loggers:
                     logger.log(rows[-1], timings[-1])
                 progress.update()
@@ -150,6 +151,7 @@ def _run(
 def _save(
     result: IterationResult,
     algorithm: Algorithm,
+    recipe: RunSettings,
     settings: dict[str, Any],
     directory: RunDirectory,
     rows: list[dict[str, Any]],
@@ -160,8 +162,6 @@ def _save(
     rows.append({**result.metrics, **marks})
     timings.append({"iteration": result.metrics["iteration"], **result.seconds})
     directory.save_checkpoint(checkpoint_of(algorithm.state_dict(), rows, timings, settings))
+    directory.tell_divergence(rows, *map(str, result.diverged[:1]))
+    keep_checkpoints(directory.checkpoint_file, recipe.checkpoint, rows)
     directory.write_results(algorithm.weights(), rows, timings)
-    if result.diverged:
-        write_atomically(directory.diverged_file, f"{result.diverged[0]}\n")
-    elif not any("diverged" in row for row in rows):
-        directory.diverged_file.unlink(missing_ok=True)

@@ -48,8 +48,9 @@ class RunDirectory:
     """Files of one run.
 
     ``config.yaml`` (resolved), ``versions.json``, ``metrics.csv`` (one row per outer iteration,
-    the source of truth), ``timing.csv`` (wall-clock seconds by phase), ``checkpoint.pt`` and the
-    one before it, ``model.pt``, ``policy.pt``, ``checksums.json`` of these, and W&B's own files.
+    the source of truth), ``timing.csv`` (wall-clock seconds by phase), ``checkpoint.pt``, the one
+    before it and those that are kept, ``model.pt``, ``policy.pt``, ``checksums.json`` of these,
+    ``diverged.txt`` where a row has a mark, and W&B's own files.
     All are replaced atomically, the checkpoint first and the metrics last, so that a row of the
     metrics says that its iteration is complete. Where one is not what the checkpoint says, it is
     made again when the run resumes.
@@ -71,14 +72,12 @@ class RunDirectory:
         # Whether the last checkpoint may take the place of the one before it.
         self.last_is_good = True
 
-    @contextmanager
-    def open(self, config: dict[str, Any], resume: bool) -> Iterator[None]:
-        """Prepare the directory for a run of ``config`` and hold it for as long as that lasts.
+    def check_open(self, config: dict[str, Any], resume: bool) -> None:
+        """Refuse a directory that a run of ``config`` cannot begin or go on in.
 
         Raises:
             RunDirectoryError: if it holds a run and ``resume`` is not set, if that run has
-                another configuration, or (:class:`RunDirectoryInUse`) if another process is
-                running in it. Nothing is changed in these cases.
+                another configuration, or if it holds something else.
         """
         if self.config_file.exists():
             if not resume:
@@ -91,6 +90,16 @@ class RunDirectory:
             raise RunDirectoryError(
                 f"{self.path} is not empty and holds no run; choose another run_dir"
             )
+
+    @contextmanager
+    def open(self, config: dict[str, Any], resume: bool) -> Iterator[None]:
+        """Prepare the directory for a run of ``config`` and hold it for as long as that lasts.
+
+        Raises:
+            RunDirectoryError: as :meth:`check_open`, or (:class:`RunDirectoryInUse`) if another
+                process is running in it. Nothing is changed in these cases.
+        """
+        self.check_open(config, resume)
         self.path.mkdir(parents=True, exist_ok=True)
         with locked(self.path / ".lock") as ours:
             if not ours:
@@ -329,6 +338,20 @@ class RunDirectory:
                 write_atomically(file, content)
                 restored.append(file.name)
         return restored
+
+    def tell_divergence(self, rows: Sequence[Mapping[str, Any]], line: str = "") -> None:
+        """Have ``diverged.txt`` as long as a row has a mark, and no longer.
+
+        Args:
+            rows: those so far.
+            line: what it is to say; if empty, what it says already, or which iteration it was.
+        """
+        marked = [row for row in rows if "diverged" in row]
+        if not marked:
+            self.diverged_file.unlink(missing_ok=True)
+        elif line or not self.diverged_file.exists():
+            line = line or f"training diverged in iteration {marked[-1]['iteration']}"
+            write_atomically(self.diverged_file, f"{line}\n")
 
     def mark_diverged(self, line: str, rows: Sequence[Mapping[str, Any]]) -> None:
         """Say that the run has stopped after these rows, the last of which gets a mark."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
 from functools import cache, partial
 from typing import Any, ClassVar
@@ -241,6 +241,13 @@ class RunSettings(ABC):
         )
         algorithm.stops_on_divergence = self.on_divergence == "stop"
         return algorithm
+
+    def build_on_cpu(self) -> Algorithm:
+        """As :meth:`build`, for a look on any machine: on the CPU, and nothing compiled."""
+        here: dict[str, Any] = {"device": "cpu"}
+        if hasattr(self, "compile_plans"):
+            here["compile_plans"] = False  # as "auto" decides on the CPU
+        return replace(self, **here).build()
 
 
 # Not in ``register``: launchers resolve them in processes of their own.

@@ -40,7 +40,8 @@ def orderly_end() -> Iterator[None]:
 
     def end(number: int, frame: FrameType | None) -> None:
         for each in _ENDING:
-            signal.signal(each, signal.SIG_DFL)
+            if signal.getsignal(each) is not signal.SIG_IGN:
+                signal.signal(each, signal.SIG_DFL)
         _say(f"torchrl-l1: stopped by {signal.Signals(number).name}")
         raise SystemExit(128 + number)
 

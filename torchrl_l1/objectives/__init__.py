@@ -2,10 +2,17 @@
 
 from torchrl_l1.objectives.gaussian_trpo import gaussian_trpo_step, is_tanh_network
 from torchrl_l1.objectives.linear_baseline import LinearFeatureBaseline
-from torchrl_l1.objectives.trpo import TRPOConfig, TRPOReport, conjugate_gradient, trpo_step
+from torchrl_l1.objectives.trpo import (
+    NonFiniteAdvantages,
+    TRPOConfig,
+    TRPOReport,
+    conjugate_gradient,
+    trpo_step,
+)
 
 __all__ = [
     "LinearFeatureBaseline",
+    "NonFiniteAdvantages",
     "TRPOConfig",
     "TRPOReport",
     "conjugate_gradient",

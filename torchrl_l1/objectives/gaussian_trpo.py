@@ -58,8 +58,8 @@ def gaussian_trpo_step(
         config: see :class:`TRPOConfig`.
 
     Raises:
-        ValueError: if the advantages are not finite, the network is of another kind, or a
-            parameter is frozen.
+        NonFiniteAdvantages: if the advantages are not finite.
+        ValueError: if the network is of another kind, or a parameter is frozen.
 
     Examples:
         >>> import torch

@@ -62,6 +62,10 @@ class TRPOReport:
     backtracks: int
 
 
+class NonFiniteAdvantages(ValueError):
+    """Advantages are infinite or no numbers: no step can be taken from them."""
+
+
 def conjugate_gradient(
     matvec: Callable[[Tensor], Tensor], b: Tensor, iterations: int, tolerance: float = 1e-10
 ) -> Tensor:
@@ -132,7 +136,8 @@ def trpo_step(
         config: see :class:`TRPOConfig`.
 
     Raises:
-        ValueError: if the advantages are not finite, or if there is not one density per sample.
+        NonFiniteAdvantages: if the advantages are not finite.
+        ValueError: if there is not one density per sample.
     """
     return take_step(_AutogradProblem(actor, data, config), data["advantage"], config)
 
@@ -146,10 +151,10 @@ def take_step(problem: TrustRegionProblem, advantage: Tensor, config: TRPOConfig
         config: settings.
 
     Raises:
-        ValueError: if the advantages are not finite.
+        NonFiniteAdvantages: if the advantages are not finite.
     """
     if not torch.isfinite(advantage).all():
-        raise ValueError("TRPO: non-finite advantages; check rewards and value estimates")
+        raise NonFiniteAdvantages("TRPO: non-finite advantages; check rewards and value estimates")
 
     def product(vector: Tensor) -> Tensor:
         return problem.fisher_product(vector) + config.damping * vector

@@ -87,6 +87,7 @@ class Evaluation(Condition):
         switch_rate: switches per step; NaN if unknown or without L1.
         steps_mean: mean length of the episodes; NaN if unknown.
         returns: of the single episodes; empty if unknown.
+        seed: of the evaluation; ``None`` if unknown.
     """
 
     return_mean: float
@@ -95,6 +96,7 @@ class Evaluation(Condition):
     switch_rate: float = math.nan
     steps_mean: float = math.nan
     returns: tuple[float, ...] = ()
+    seed: int | None = None
 
     @property
     def condition(self) -> tuple[Any, ...]:

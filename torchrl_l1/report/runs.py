@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -218,12 +218,13 @@ def _read_table(file: Path, iterations: int | None) -> list[Evaluation]:
     """
     if not re.fullmatch(r"[A-Za-z0-9_.+-]{1,100}", file.stem):
         raise RunDirectoryError(f"cannot use {file}: its name is no word of at most 100 letters")
-    described, known, made_after = file.with_suffix(".yaml"), None, iterations
+    described, known, made_after, seed = file.with_suffix(".yaml"), None, iterations, None
     # Where it says nothing it is the table that counts.
     with suppress(OSError, ValueError, LookupError, TypeError, AttributeError):
         if described.exists():
             content = load_yaml(described)
             made_after, known = content["iterations"], content.get("checksums")
+            seed = content.get("seed")
     if isinstance(known, dict) and known != table_checksums(file):
         raise RunDirectoryError(
             f"{file} or the table of its episodes is not as it was written (see {described.name}); "
@@ -234,7 +235,7 @@ def _read_table(file: Path, iterations: int | None) -> list[Evaluation]:
             f"{file} was made after {made_after} iterations, and the run has {iterations}; its "
             "campaign makes it again"
         )
-    return read_evaluations(file)
+    return [replace(test, seed=seed) for test in read_evaluations(file)]
 
 
 def _diverged(file: Path) -> str:

@@ -173,7 +173,8 @@ def _distinct(runs: Sequence[Run], same: Callable[[Run], Hashable]) -> tuple[lis
 
     An evaluation that the one lacks comes from another that is as far. Of an evaluation that
     both have, the conditions that are missing come from it too where the returns of the
-    trainings are equal: then they are evaluations of the same policy.
+    trainings are equal, and the seed and the number of the episodes: then they are of the same
+    policy, from the same resets.
 
     Args:
         runs: the runs, in order of preference.
@@ -201,7 +202,12 @@ def _merged_evaluations(best: Run, others: Sequence[Run]) -> dict[str, list[Eval
                 merged[name] = list(tests)
             elif np.array_equal(other.returns, best.returns):
                 known = {test.condition for test in merged[name]}
-                merged[name] += [test for test in tests if test.condition not in known]
+                drawn = [(test.seed, test.episodes) for test in merged[name]]
+                merged[name] += [
+                    test
+                    for test in tests
+                    if test.condition not in known and (test.seed, test.episodes) in drawn
+                ]
     return merged
 
 
