@@ -34,8 +34,8 @@ RETURN_METRICS: dict[str, str] = {
 """What the episodes of a round show, whatever collected them."""
 
 L1_METRICS: dict[str, str] = {
-    "l1/switch_rate": "Switches of the operating point per real step; about 1 with a Kalman filter, "
-    "whose operating point follows the executed input.",
+    "l1/switch_rate": "Switches of the operating point per real step; about 1 with a Kalman "
+    "filter, whose operating point follows the executed input.",
     "l1/affinization_error": "Mean distance between model and affine model at the tested input, "
     "raw state units, before switching.",
     "l1/affinization_error_max": "Largest such distance.",
