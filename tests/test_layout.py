@@ -73,7 +73,7 @@ def test_nothing_lies_about_that_is_no_part_of_the_project() -> None:
     assert {name.split("/")[0] for name in files} <= folders | texts | tools | {".gitignore"}
     kinds = {Path(name).suffix for name in files if not name.startswith(".")}
     code, prose = {".py", ".typed"}, {".md", ".txt", ".cff", ""}
-    assert kinds <= code | prose | {".csv", ".json", ".png", ".toml", ".xml", ".yaml"}
+    assert kinds <= code | prose | {".csv", ".json", ".png", ".toml", ".xml", ".xz", ".yaml"}
 
 
 def test_imports_point_one_way() -> None:

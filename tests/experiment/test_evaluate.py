@@ -290,9 +290,8 @@ def test_values_that_a_controller_has_not_are_refused_before_the_work(
         main(["evaluate", str(directory), *options])
     assert "none of off, robust has a low-pass filter" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-    cells = [Condition("off"), Condition("robust", alpha=0.1)]
     with pytest.raises(ValueError, match="L1 robust"):
-        next(evaluate(load_run(directory), cells, 1))
+        next(evaluate(load_run(directory), [Condition("robust", alpha=0.1)], 1))
 
 
 def test_typo_in_an_override_fails_and_writes_nothing(
