@@ -45,6 +45,7 @@ from torchrl_l1.algorithms.policy_improvement import (
 )
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import read_transitions
+from torchrl_l1.dynamics.imagination import one_each
 from torchrl_l1.dynamics.network import model_precision
 from torchrl_l1.dynamics.transitions import Data, check_time_step
 from torchrl_l1.envs import AnyTask, Perturbation, action_bounds
@@ -191,6 +192,7 @@ class Offline(Algorithm):
         observation, action, following = (
             read.data[key] for key in ("observation", "action", ("next", "observation"))
         )
+        reward = one_each(self.outcomes.reward, "reward", observation, action, following)
         flat = TensorDict(
             {
                 "observation": observation,
@@ -198,7 +200,7 @@ class Offline(Algorithm):
                 "executed": action,
                 "next": {
                     "observation": following,
-                    "reward": self.outcomes.reward(observation, action, following)[:, None],
+                    "reward": reward[:, None],
                     "non_finite": torch.zeros(rows, 1, dtype=torch.bool),
                 },
             },
