@@ -189,10 +189,7 @@ def _poses(trained: TrainedRun, cell: Condition, steps: int, seed: int) -> np.nd
 
 
 def _check_one_study(runs: Sequence[TrainedRun]) -> None:
-    """Runs may differ in their seed and in nothing that matters.
-
-    The best of their checkpoints may be of any iteration.
-    """
+    """Runs may differ in their seed and in nothing that matters."""
 
     def settings(trained: TrainedRun) -> RunSettings:
         return replace(
@@ -225,13 +222,6 @@ def _check_one_study(runs: Sequence[TrainedRun]) -> None:
                 f"{runs[0].path} and {trained.path} differ in more than their seed; evaluate them "
                 "one at a time"
             )
-        iterations = [one.algorithm.iteration for one in (runs[0], trained)]
-        best = {runs[0].checkpoint, trained.checkpoint} == {"best"}
-        if len(set(iterations)) > 1 and not best:
-            raise ValueError(
-                f"{runs[0].name} is of {iterations[0]} iterations and {trained.name} of "
-                f"{iterations[1]}; let both get equally far, or evaluate them one at a time"
-            )
     seeds: dict[int, TrainedRun] = {}
     for trained in runs:
         other = seeds.setdefault(trained.recipe.seed, trained)
@@ -245,8 +235,11 @@ def _check_one_study(runs: Sequence[TrainedRun]) -> None:
 def _stages(runs: Sequence[TrainedRun], asked: Sequence[str]) -> list[str]:
     """The stages to evaluate: those asked for, else the last that there is.
 
+    The best of kept checkpoints may be of any iteration.
+
     Raises:
-        ValueError: for one that a run has not, or if the last is not the same in all runs.
+        ValueError: for one that a run has not, or if none is asked for and runs are differently
+            far.
     """
     names = asked or (None,)
     found = [list(dict.fromkeys(map(trained.stage, names))) for trained in runs]
@@ -256,6 +249,14 @@ def _stages(runs: Sequence[TrainedRun], asked: Sequence[str]) -> list[str]:
                 f"{runs[0].path} has reached the stage {found[0][0]} and {trained.path} "
                 f"{stages[0]}; say with --stage which one to evaluate"
             )
+    if not asked and any(trained.checkpoint != "best" for trained in runs):
+        for trained in runs:
+            if trained.algorithm.iteration != runs[0].algorithm.iteration:
+                raise ValueError(
+                    f"{runs[0].name} is of {runs[0].algorithm.iteration} iterations and "
+                    f"{trained.name} of {trained.algorithm.iteration}; let both get equally far, "
+                    "or evaluate them one at a time"
+                )
     return found[0]
 
 
