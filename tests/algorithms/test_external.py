@@ -149,7 +149,6 @@ def test_known_rewards_are_those_of_imagination() -> None:
     assert task.horizon == 1000
 
 
-@pytest.mark.filterwarnings("ignore:the Kalman filter takes the residuals")  # of short episodes
 def test_robust_l1_acts_within_bounds_of_each_entry() -> None:
     robust = L1Config.robust(0.1, action_low=LOW, action_high=HIGH)
     task = ExternalTask(environment_source(Raft), horizon=12)

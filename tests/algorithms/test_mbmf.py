@@ -85,7 +85,6 @@ def saved(l1: str) -> tuple[list[dict[str, float]], list[dict[str, Any]]]:
     return rows, states
 
 
-@pytest.mark.filterwarnings("ignore:the Kalman filter takes the residuals")  # of short episodes
 @pytest.mark.parametrize(
     ("l1", "done"), [*itertools.product(["off", "paper"], range(1, 6)), ("robust", 1)]
 )

@@ -48,7 +48,6 @@ def test_every_metric_is_finite(head: str, propagation: str) -> None:
     assert not (data["action"] == data["executed"])[20:].all()
 
 
-@pytest.mark.filterwarnings("ignore:the Kalman filter takes the residuals")  # of short episodes
 @pytest.mark.parametrize("l1", [None, L1, ROBUST], ids=["off", "paper", "robust"])
 def test_resumed_run_repeats_the_unbroken_one(l1: L1Config | None) -> None:
     unbroken = [result.metrics for result in make(l1, outer_iterations=3, fit_every=2).iterate()]

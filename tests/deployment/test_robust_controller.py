@@ -141,7 +141,6 @@ def test_objects_are_asked_for_again(robust, tmp_path):
 @pytest.mark.parametrize(
     ("l1", "preset"), [("paper", "paper"), ("off", "robust"), ("reference", "robust")]
 )
-@pytest.mark.filterwarnings("ignore:the Kalman filter takes the residuals")  # of short episodes
 def test_runs_bring_their_own_model_and_settings(l1, preset, tiny_recipe, tmp_path):
     run(tiny_recipe("outer_iterations=1", f"l1={l1}", "l1.epsilon=0.7"))
     robust = load_target(str(tmp_path / "run"))

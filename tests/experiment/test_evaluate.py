@@ -219,7 +219,6 @@ def test_the_oracle_undoes_a_bias_and_is_nobodys_own_controller(tiny_recipe: Rec
     assert kept["own_l1"] == 0
 
 
-@pytest.mark.filterwarnings("ignore:the Kalman filter takes the residuals")  # of short episodes
 def test_a_suite_ends_in_a_table_of_what_is_recovered(
     tiny_recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
