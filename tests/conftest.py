@@ -52,6 +52,9 @@ PRELOADED = (
     "wandb.sdk.launch.inputs.internal",
 )
 
+# As in a terminal, also where nohup runs the tests: they send it, and what is ignored stays so.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
 if HAS_FORKS:
     # It starts with the first process that is asked of it, and ends with this one.
     multiprocessing.get_context("forkserver").set_forkserver_preload(list(PRELOADED))
