@@ -52,8 +52,10 @@ PRELOADED = (
     "wandb.sdk.launch.inputs.internal",
 )
 
-# As in a terminal, also where nohup runs the tests: they send it, and what is ignored stays so.
+# As in a terminal, also in the background or under nohup: the tests send these, and what is ignored
+# stays so.
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 if HAS_FORKS:
     # It starts with the first process that is asked of it, and ends with this one.
