@@ -47,8 +47,8 @@ SETTINGS: dict[type, tuple[str, dict[str, Any]]] = {
 }
 # Infinity there is no bound.
 UNBOUNDED = {
-    (L1Config, "action_low"): (-math.inf, math.inf),
-    (L1Config, "action_high"): (-math.inf, math.inf),
+    (L1Config, "action_low"): (-math.inf,),
+    (L1Config, "action_high"): (math.inf,),
     (L1Config, "max_error"): (math.inf,),
 }
 
