@@ -495,6 +495,5 @@ def test_a_model_that_nobody_has_calibrated_is_told_of_once(settings, warned):
         with warnings.catch_warnings(record=True) as found:
             warnings.simplefilter("always")
             env.rollout(2)
-        assert ["call calibrate_filter(" in str(each.message) for each in found] == [
-            True
-        ] * expected
+        told = ["call calibrate_filter(" in str(each.message) for each in found]
+        assert told == [True] * expected

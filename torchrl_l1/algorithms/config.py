@@ -89,7 +89,7 @@ def check_covariance(l1: L1Config | None, model: ModelConfig, elites: int | None
     Raises:
         ValueError: naming the setting of the model.
     """
-    if l1 is None or (l1.filter != "kalman" and l1.estimator != "weighted"):
+    if l1 is None or not l1.needs_covariance:
         return
     if l1.covariance == "heads" and model.head != "gaussian":
         raise ValueError(

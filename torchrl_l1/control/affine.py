@@ -313,7 +313,8 @@ def make_step(
         return *augment_silently(config, model, state, observation, u_rl)[:2], None
 
     known = ("residual_statistics", "residual_covariance")
-    if _weighs(config) and not any(callable(getattr(model.dynamics, name, None)) for name in known):
+    is_known = any(callable(getattr(model.dynamics, name, None)) for name in known)
+    if config.needs_covariance and not is_known:
         setting = "estimator='weighted'" if config.estimator == "weighted" else "filter='kalman'"
         warnings.warn(
             f"{setting} knows no covariance of {type(model.dynamics).__name__}'s residuals and "
@@ -329,11 +330,6 @@ def make_step(
     return _prepared(whole, config, model)
 
 
-def _weighs(config: L1Config) -> bool:
-    """Whether the covariance of the model's residuals matters."""
-    return config.filter == "kalman" or config.estimator == "weighted"
-
-
 def _prepared(step: StepFunction, config: L1Config, model: ActionJacobian) -> StepFunction:
     """The step of a model that is looked at before the first one, and after ``train()``."""
     # Another controller may have looked at the model, but not at what this one asks of it.
@@ -347,7 +343,7 @@ def _prepared(step: StepFunction, config: L1Config, model: ActionJacobian) -> St
         with FORWARD_MODE:  # where the step is compiled, torch differentiates while it traces
             action = saturate(config, u_rl)
             model.prepare(observation, action)
-            if _weighs(config):
+            if config.needs_covariance:
                 probe_covariance(
                     model.dynamics,
                     lambda x, u: model.residual_statistics(x, u, config.covariance).covariance,

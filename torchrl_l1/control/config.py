@@ -280,6 +280,11 @@ class L1Config:
         return _tuple(high)[0] - _tuple(low)[0]
 
     @property
+    def needs_covariance(self) -> bool:
+        """Whether the covariance of the model's residuals matters."""
+        return self.filter == "kalman" or self.estimator == "weighted"
+
+    @property
     def half_range(self) -> Scalars:
         """Half the range of the action, one where a bound is missing or none; action units.
 
