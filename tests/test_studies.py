@@ -175,21 +175,23 @@ def test_cells_are_of_the_edition_with_most_pairs(
     pairs_of = dict(zip(questions.METRPO.editions, many, strict=True))
 
     def rows_of(edition: str, name: str) -> list[dict[str, str]]:
-        key = {"task": "swimmer", "noise": "none"}
+        key = {"task": "swimmer", "noise": "none", "variant": ""}
+        other = {"variant": "l1.epsilon=1"}
         if name == "training.csv":
-            return [key | {"l1": "off", "return_mean": "7"}]
+            off = key | {"l1": "off", "return_mean": "7"}
+            return [off, off | other | {"return_mean": "8"}]
         seeds = list(map(str, range(pairs_of[edition])))
         if name == "runs.csv":
             # One more without L1 than there are pairs.
             runs = [("off", seed) for seed in [*seeds, "9"]] + [("paper", seed) for seed in seeds]
             returns = {"off": 1.0, "paper": 2.0}
             return [
-                key
-                | {"l1": l1, "variant": "", "seed": seed, "return": str(returns[l1] + int(seed))}
+                key | {"l1": l1, "seed": seed, "return": str(returns[l1] + int(seed))}
                 for l1, seed in runs
             ]
         counted = {"pairs": str(len(seeds)), "seeds": " ".join(seeds)}
-        return [key | {"l1": "paper", "policy": "stochastic"} | counted]
+        pair = key | {"l1": "paper", "policy": "stochastic"} | counted
+        return [pair | other | {"seeds": "8"}, pair]
 
     monkeypatch.setattr(questions, "rows", rows_of)
     found = questions.ours(questions.METRPO, "swimmer", "none", "paper")
