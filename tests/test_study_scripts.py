@@ -10,8 +10,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from scipy.stats import ttest_1samp
 
 from tests.test_studies import RESULTS, script
 
@@ -22,6 +24,63 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     figures: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
     return figures
+
+
+def test_the_sample_of_the_suite_is_its_resets(monkeypatch: pytest.MonkeyPatch) -> None:
+    suite = script("suite", monkeypatch)
+    rng = np.random.default_rng(0)
+    undisturbed, off, on = (rng.normal(mean, 1.0, 8) for mean in (10.0, 4.0, 8.0))
+    # A second value at which the same comes of each reset says nothing new.
+    cells = [("bias", 1.0), ("bias", 2.0)]
+    returns = {("seed_0", "off", suite.NONE): undisturbed}
+    for cell in cells:
+        returns |= {("seed_0", "off", cell): off, ("seed_0", "robust", cell): on}
+    mean, interval = suite.change(returns, "robust", cells)
+    shares = (on - off) / undisturbed.mean()
+    expected = ttest_1samp(shares, 0.0).confidence_interval()
+    found = [mean, interval.low, interval.high]
+    np.testing.assert_allclose(found, [shares.mean(), expected.low, expected.high])
+    loss = undisturbed - off
+    share, ends = suite.regained(returns, "robust", cells)
+    assert share == pytest.approx((on - off).mean() / loss.mean())
+    for end in (ends.low, ends.high):
+        assert ttest_1samp(on - off - end * loss, 0.0).pvalue == pytest.approx(0.05)
+
+
+def test_figure_of_the_suite_says_what_lies_beyond_its_colours(
+    drawn: list[Figure], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite = script("suite", monkeypatch)
+    suite.plot({"walker": suite.read("walker")}, tmp_path / "verdicts.png")
+    images = [axis.images[0] for axis in drawn[0].axes[:2]]
+    assert min(image.get_array().min() for image in images) < images[-1].norm.vmin
+    assert images[-1].colorbar.extend == "both"
+
+
+def test_no_model_lies_outside_the_figure(
+    drawn: list[Figure], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fit_quality = script("fit_quality", monkeypatch)
+    with (RESULTS / "fit_quality/runs.csv").open(newline="") as handle:
+        fit_quality.draw(list(csv.DictReader(handle)), tmp_path / "quality.png")
+    for axis in drawn[0].axes:
+        low, high = axis.get_xlim()
+        for line in axis.lines[:2]:
+            assert low < min(line.get_xdata()) and max(line.get_xdata()) < high
+
+
+def test_returns_of_either_sign_do_not_shrink_what_harm_is_measured_by(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    robust = script("robust", monkeypatch)
+    returns = {"good": {"off": 100.0, "paper": 80.0}, "bad": {"off": -60.0, "paper": -60.0}}
+    episodes = [
+        {"run": run, "l1": l1, "noise": "none", "bias": 0.0, "signs": 0.0, "return": value}
+        for run, of in returns.items()
+        for l1, value in of.items()
+    ]
+    # -20 and 0, of 100 and 60.
+    assert robust.harm(episodes, "none", "paper", draws=2)["mean"] == "-12.5"
 
 
 def write(file: Path, rows: Sequence[dict[str, Any]]) -> None:
