@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import pickle
 import shlex
 from collections.abc import Callable
@@ -15,6 +16,7 @@ import torch
 from omegaconf import DictConfig
 from safetensors.torch import save_file
 from tensordict import TensorDict, lazy_stack
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_l1.algorithms import DatasetColumns
 from torchrl_l1.cli import main
@@ -121,6 +123,48 @@ def test_trajectories_of_different_lengths_in_a_folder() -> None:
         assert read.data["observation"].flatten().tolist() == [0, 1, 2, 0, 1, 2, 3, 4]
     with pytest.raises(KeyError, match="ragged has no observation, only action"):
         read_dataset("ragged")
+
+
+def steps(*shape: int) -> TensorDict:
+    """Transitions of a plant that counts."""
+    x = torch.arange(1.0, 1 + math.prod(shape)).reshape(*shape, 1)
+    after = {"observation": x + 1, "done": torch.zeros_like(x, dtype=torch.bool)}
+    return TensorDict({"observation": x, "action": -x, "next": after}, shape)
+
+
+@pytest.mark.parametrize("storage", [LazyTensorStorage, LazyMemmapStorage])
+def test_of_a_replay_buffer_what_it_holds(storage: type[LazyTensorStorage]) -> None:
+    buffer = TensorDictReplayBuffer(storage=storage(20))
+    buffer.extend(steps(5))
+    buffer.dumps("rb")
+    for source in ("rb", "rb/storage"):
+        found = read_dataset(source)
+        assert found["observation"].flatten().tolist() == [1, 2, 3, 4, 5]
+    buffer.extend(steps(18))  # five there, fifteen behind them, three in place of the first
+    buffer.dumps("rb")
+    found = read_dataset("rb")
+    assert found["observation"].flatten().tolist() == [16, 17, 18, 4, 5, *range(1, 16)]
+    Path("rb/storage/storage_metadata.json").write_text("{")
+    with pytest.raises(ValueError, match="no tensordict that can be read"):
+        read_dataset("rb")
+
+
+@pytest.mark.parametrize("ndim", [1, 2])
+def test_a_replay_buffer_of_batches_must_be_full(ndim: int) -> None:
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20, ndim=ndim))
+    buffer.extend(steps(2, 5))
+    buffer.dumps("rb")
+    with pytest.raises(ValueError, match=r"buffer of batches.*buffer\[:\]\.memmap\(folder\)"):
+        read_dataset("rb")
+    buffer[:].memmap("all")
+    assert read_dataset("all").shape == (2, 5)
+
+
+def test_the_empty_rest_of_a_buffer_s_own_folder_is_told() -> None:
+    buffer = TensorDictReplayBuffer(storage=LazyMemmapStorage(20, scratch_dir="scratch"))
+    buffer.extend(steps(5))
+    with pytest.warns(UserWarning, match=r"last 15 of 20 rows .* are zeros.*buffer\.dumps"):
+        assert read_dataset("scratch").shape == (20,)
 
 
 def test_a_table_needs_names() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+import warnings
 from collections.abc import Callable, Container, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,9 +28,9 @@ def read_dataset(source: str, columns: DatasetColumns | None = None) -> TensorDi
 
     Args:
         source: a ``.npz``, ``.csv``, ``.pt`` or ``.safetensors`` file; the folder of a run, of a
-            memory-mapped tensordict or of a Minari dataset; or the name of a Minari dataset that is
-            on this machine, such as ``hopper/medium-v0``. Of a run the real transitions of its
-            checkpoint count.
+            memory-mapped tensordict, of a replay buffer's ``dumps`` or of a Minari dataset; or the
+            name of a Minari dataset that is on this machine, such as ``hopper/medium-v0``. Of a run
+            the real transitions of its checkpoint count.
         columns: what the observation, the action and so on are called there.
 
     Returns:
@@ -39,6 +41,9 @@ def read_dataset(source: str, columns: DatasetColumns | None = None) -> TensorDi
         KeyError: if it lacks what it should hold, or what ``columns`` name.
         ValueError: if it cannot be read, is of a kind that is not known, or has no use for what
             ``columns`` name.
+
+    Warns:
+        UserWarning: if a tensordict ends in zeros, as a storage that is not full does.
     """
     check_dataset(source)
     columns = columns or DatasetColumns()
@@ -178,19 +183,56 @@ def _folder(path: Path) -> TensorDictBase:
     for inside in (path, path / "data"):
         if (inside / "metadata.json").is_file():
             return _of_minari(inside)
+    if (path / "buffer_metadata.json").is_file():
+        path = path / "storage"
     if (path / "meta.json").is_file():
         for pattern in _PICKLES:
             for found in path.rglob(pattern):
                 raise ValueError(f"{found} is a pickle, which is not read; leave it out")
         try:
-            return TensorDict.load_memmap(path)
+            data, filled = TensorDict.load_memmap(path), _filled(path)
         # What damaged files raise has no common class.
         except Exception as error:
             raise ValueError(f"{path} is no tensordict that can be read: {error}") from error
+        return _written_rows(path, data, filled)
     raise ValueError(
-        f"{path} holds no dataset: no run (config.yaml), no tensordict (meta.json), none of "
-        "Minari's (metadata.json)"
+        f"{path} holds no dataset: no run (config.yaml), no tensordict (meta.json), no replay "
+        "buffer (buffer_metadata.json), none of Minari's (metadata.json)"
     )
+
+
+def _filled(path: Path) -> int | None:
+    """How much a replay buffer holds, which its ``dumps`` writes beside the storage."""
+    file = path / "storage_metadata.json"
+    return int(json.loads(file.read_text(encoding="utf-8"))["len"]) if file.is_file() else None
+
+
+def _written_rows(path: Path, data: TensorDictBase, filled: int | None) -> TensorDictBase:
+    """The data without the rows of a replay buffer that nothing has been written to."""
+    if filled is not None:
+        # Of a storage of batches, rows or single steps are counted, which nothing tells apart.
+        if data.ndim > 1 and filled != data.numel():
+            raise ValueError(
+                f"{path} is of a replay buffer of batches, and does not say which are filled: "
+                "write them by buffer[:].memmap(folder)"
+            )
+        return data[:filled]
+    if isinstance(data, TensorDict) and data.ndim and (empty := _zeros_at_the_end(data)):
+        warnings.warn(
+            f"the last {empty} of {len(data)} rows of {path} are zeros, as in the storage of a "
+            "replay buffer that is not full: write what it holds by buffer.dumps(folder)",
+            stacklevel=4,
+        )
+    return data
+
+
+def _zeros_at_the_end(data: TensorDict) -> int:
+    """How many rows there are behind the last one that holds anything."""
+    written = torch.zeros(len(data), dtype=torch.bool)
+    for value in data.values(True, True):
+        if isinstance(value, torch.Tensor):
+            written |= (value.unsqueeze(-1) != 0).flatten(1).any(-1)
+    return int(written.flip(0).cumsum(0).eq(0).sum())
 
 
 def _of_run(path: Path) -> TensorDictBase:
