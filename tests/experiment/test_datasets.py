@@ -177,6 +177,11 @@ def test_a_table_needs_names() -> None:
         text = Path("drive.csv").read_text().replace(",", mark)
         Path("other.csv").write_text("\n" + text)
         assert (read_dataset("other.csv", columns) == read_dataset("drive.csv", columns)).all()
+    for header in ("x,u,episode", ' "episode" , "x","u"'):  # as an array of this name in .npz files
+        cells = [(x, 0, x // 3) if header[0] == "x" else (x // 3, x, 0) for x in range(6)]
+        Path("runs.csv").write_text("\n".join([header, *(f"{a},{b},{c}" for a, b, c in cells)]))
+        data = read_dataset("runs.csv", DatasetColumns(["x"], ["u"]))
+        assert data["observation"].flatten().tolist() == [0, 1, 3, 4]
     arrays = {"x": np.arange(6.0), "u": np.zeros(6), "run": np.array([0, 0, 0, 1, 1, 1])}
     np.savez("drive.npz", **arrays)
     data = read_dataset("drive.npz", DatasetColumns(["x"], ["u"], episode="run"))

@@ -94,7 +94,9 @@ def _csv(path: Path, columns: DatasetColumns) -> TensorDict:
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         header = next((line for line in file if line.strip()), "")
     delimiter = next((mark for mark in (",", ";", "\t") if mark in header), ",")
-    return read_csv(path, **vars(columns), delimiter=delimiter)
+    names = [name.strip(' "\n') for name in header.split(delimiter)]
+    episode = columns.episode or ("episode" if "episode" in names else None)
+    return read_csv(path, **vars(columns) | {"episode": episode}, delimiter=delimiter)
 
 
 def _npz(path: Path, columns: DatasetColumns) -> TensorDict:
