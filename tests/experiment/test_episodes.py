@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 from torchrl_l1.dynamics import read_transitions
 from torchrl_l1.envs import BatchedMujocoEnv, get_task
-from torchrl_l1.experiment.datasets import read_dataset
+from torchrl_l1.experiment.datasets import is_minari_name, read_dataset
 from torchrl_l1.experiment.episodes import Episode, check_output, split_episodes, write_dataset
 
 pytestmark = pytest.mark.usefixtures("own_folder")
@@ -82,6 +83,39 @@ def test_what_is_written_is_read_again(output: str, episodes: list[Episode]) -> 
         arrays = np.load(output)
         assert arrays["observation"].dtype == arrays["reward"].dtype == np.float32
         assert arrays["truncated"].sum() == 9 and not arrays["terminated"].any()
+
+
+@pytest.mark.parametrize("output", ["{}/hopper-v0", "t/x-v0", "./data/hopper-v0"])
+def test_a_path_is_a_folder_although_it_ends_in_a_version(
+    output: str, episodes: list[Episode], tmp_path: Path
+) -> None:
+    """Names of Minari's begin with no slash, and have two letters before one."""
+    output = output.format(tmp_path / "deep")
+    with pytest.raises(FileNotFoundError, match="no such dataset"):
+        read_dataset(output)
+    write_dataset(output, episodes, get_task("inverted_pendulum"), "random")
+    assert (Path(output) / "meta.json").is_file() and not Path("minari").exists()
+    assert len(read_dataset(output)) == sum(map(len, episodes))
+
+
+def test_names_of_datasets_are_those_that_minari_takes() -> None:
+    pattern = pytest.importorskip("minari.dataset.minari_dataset").DATASET_ID_RE
+    for name in ("a-v0", "ab/c-v1", "a/b/c-v0", "d4rl_x/hop-per/medium-v2", "a/b-v0", "/ab/c-v0",
+                 "ab//c-v0", "a.b-v0", "ab/c/", "ab/c-v0\n"):  # fmt: skip
+        assert is_minari_name(name) == bool(pattern.fullmatch(name)), name
+
+
+def test_what_has_words_in_place_of_a_number_keeps_them(
+    episodes: list[Episode], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As h5py's errors do."""
+
+    def torn(*_: Any, **__: Any) -> None:
+        raise OSError("Can't write data (file write failed)")
+
+    monkeypatch.setattr(TensorDict, "memmap", torn)
+    with pytest.raises(OSError, match=r"^folder cannot be written: Can't write data \(file"):
+        write_dataset("folder", episodes, get_task("inverted_pendulum"), "random")
 
 
 def test_the_place_of_a_dataset_says_what_it_is_of(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,8 @@ from torchrl_l1.dynamics import read_csv, read_minari, read_npz
 from torchrl_l1.experiment.checkpoints import read_checkpoint
 from torchrl_l1.experiment.errors import RunDirectoryError
 
-_MINARI_NAME = re.compile(r"[-\w/]+-v\d+")
+# As Minari has it, but for names without a version.
+_MINARI_NAME = re.compile(r"([-\w][-\w/]*[-\w]+/)?[-\w]+-v\d+")
 _CHECKPOINTS = ("checkpoint.pt", "checkpoint_previous.pt")
 _PICKLES = ("*.pkl", "*.pickle")
 

@@ -127,6 +127,8 @@ def _beside(path: Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
+        if error.errno is None:  # of h5py, which has words alone
+            raise OSError(f"{path} cannot be written: {error}") from error
         raise type(error)(error.errno, error.strerror, str(path)) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
