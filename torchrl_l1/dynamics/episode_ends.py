@@ -51,7 +51,7 @@ def told_ends(
         elif _NUMBERS.fullmatch(name.lower()):
             found[name] = np.append((rows[1:] != rows[:-1]).any(-1), False)
         else:
-            found[name] = np.append(_breaks(rows), False)
+            found[name] = np.append(_breaks(rows[:, 0]), False)
     return found
 
 
@@ -73,11 +73,11 @@ def _is_true(cell: str) -> bool:
 def _breaks(clock: np.ndarray) -> np.ndarray:
     """Where a time goes back, or on by much more than usual; nowhere if it is no number."""
     try:
-        steps = np.diff(clock.astype(np.float64), axis=0)
+        steps = np.diff(clock.astype(np.float64))
     except ValueError:
         return np.zeros(len(clock) - 1, dtype=bool)
     usual = np.median(steps[steps > 0]) if (steps > 0).any() else np.inf
-    return ((steps < 0) | (steps > _GAP * usual)).any(-1)
+    return (steps < 0) | (steps > _GAP * usual)
 
 
 def check_ends(path: str, name: str, ends: np.ndarray) -> None:
