@@ -109,7 +109,7 @@ class ExternalTask:
         env = self.source.build()
         plain = type(env) in (GymEnv, GymWrapper) and getattr(env, "wrapper_frame_skip", 1) == 1
         if plain and isinstance(env._env, gymnasium.Env):
-            return SingleGymnasiumEnv(env._env, self.name, self._keys)
+            return SingleGymnasiumEnv(env, self.name, self._keys)
         return SingleTorchRLEnv(env, self.name, self._keys)
 
     @property
