@@ -10,7 +10,8 @@ import torch
 from gymnasium.spaces import Box, Dict, Discrete
 from gymnasium.utils import EzPickle
 from gymnasium.wrappers import DtypeObservation
-from torchrl.envs import GymEnv, GymWrapper, StepCounter, TransformedEnv
+from torchrl.data import Unbounded
+from torchrl.envs import GymEnv, GymWrapper, StepCounter, Transform, TransformedEnv
 
 from torchrl_l1.envs import ExternalTask, environment_source
 
@@ -43,6 +44,20 @@ class Plant(gymnasium.Env):
 
 def task_of(make, **settings):
     return ExternalTask(environment_source(make), horizon=9, **settings)
+
+
+class Twofold(Transform):
+    """The reward in two parts."""
+
+    def __init__(self):
+        super().__init__(in_keys=["reward"], out_keys=["reward"])
+
+    def _apply_transform(self, reward):
+        return torch.cat([reward, reward], -1)
+
+    def transform_reward_spec(self, reward_spec):
+        reward_spec["reward"] = Unbounded((2,))
+        return reward_spec
 
 
 def counted(make):
@@ -130,5 +145,8 @@ def test_whole_numbers_are_refused_where_they_are_trained_on_and_where_they_are_
 def test_a_reward_of_several_numbers_is_named():
     env = task_of(lambda: Plant(reward=np.ones(2))).environment(1)
     with pytest.raises(ValueError, match=r"the environment returned a reward of shape \(2,\); one"):
+        env.rollout(2)
+    env = task_of(lambda: TransformedEnv(GymEnv("Pendulum-v1"), Twofold())).environment(1)
+    with pytest.raises(ValueError, match=r"a reward of shape \(2,\); one"):
         env.rollout(2)
     assert task_of(lambda: Plant(reward=np.ones(1))).environment(1).rollout(2).shape == (1, 2)

@@ -185,13 +185,8 @@ class SingleGymnasiumEnv(_Single):
         within = np.clip(action.astype(space.dtype), space.low, space.high)
         stepped = self._parts("step", self.env.step(within), 5)
         observation, reward, terminated, truncated, _ = stepped
-        earned = np.asarray(reward, dtype=np.float64)
-        if earned.size != 1:  # some give an array with one number
-            raise ValueError(
-                f"{self._name} returned a reward of shape {earned.shape}; one number is needed: "
-                "sum them, or choose one, in a gymnasium.Wrapper"
-            )
-        return self._observed(observation), earned.item(), bool(terminated), bool(truncated)
+        earned = _number(self._name, reward)
+        return self._observed(observation), earned, bool(terminated), bool(truncated)
 
     def time_step(self) -> float | None:
         """See :class:`SingleEnv`."""
@@ -219,6 +214,7 @@ class SingleTorchRLEnv(_Single):
                 f"{name} is a batch of {tuple(env.batch_size)} environments; let it return a "
                 "single one, which is made as often as it is needed"
             )
+        self._name = name
         parts = vectors(env)
         if not keys and "observation" in parts:
             left_out = parts_left_out(env, parts)
@@ -255,7 +251,7 @@ class SingleTorchRLEnv(_Single):
         terminated = stepped.get("terminated", None)
         over = ended and not late if terminated is None else bool(terminated.any())
         late = late or (ended and not over)
-        return self._observed(stepped), float(stepped["reward"].sum()), over, late
+        return self._observed(stepped), _number(self._name, stepped["reward"]), over, late
 
     def _observed(self, data: TensorDictBase) -> np.ndarray:
         observation: np.ndarray = data["observation"].reshape(-1).float().numpy().copy()
@@ -296,6 +292,17 @@ class SingleTorchRLEnv(_Single):
     def close(self) -> None:
         """See :class:`SingleEnv`."""
         self.env.close(raise_if_closed=False)
+
+
+def _number(name: str, reward: Any) -> float:
+    """A reward, which some give as an array with one number."""
+    earned = np.asarray(reward, dtype=np.float64)
+    if earned.size != 1:
+        raise ValueError(
+            f"{name} returned a reward of shape {earned.shape}; one number is needed: sum them, or "
+            "choose one, in a wrapper or transform"
+        )
+    return earned.item()
 
 
 def _copied(original: Any, memo: dict[int, Any]) -> Any:

@@ -47,6 +47,7 @@ MakeEnv: TypeAlias = str | Task | Callable[[], EnvBase]
 """A name, a task of ours, or a function that makes an environment."""
 
 AnyEnv: TypeAlias = EnvBase | gymnasium.Env[Any, Any]
+"""An environment of TorchRL, or one of Gymnasium as it is."""
 
 FORMS = (
     "gymnasium/ID (gymnasium/Pendulum-v1), a task of ours "
