@@ -18,6 +18,7 @@ from torchrl.envs import EnvBase, FrameSkipTransform, GymWrapper, StepCounter, T
 from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.envs.utils import step_mdp
 
+from torchrl_l1.checks import LARGEST_BOUND
 from torchrl_l1.control import repeats, time_step
 from torchrl_l1.envs.known_rewards import Outcome, known_outcome
 from torchrl_l1.envs.sources import (
@@ -33,9 +34,6 @@ from torchrl_l1.envs.sources import (
 
 PAGE = "see the page on environments"
 """Where the forms of environments are explained."""
-
-# Beyond it a bound is none: some packages write the largest float for infinity.
-_LARGEST_BOUND = 1e9
 
 
 class SingleEnv(Protocol):
@@ -349,7 +347,7 @@ def _unbounded(name: str, found: str) -> str:
 
 def _checked_bounds(name: str, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     low, high = low.astype(np.float32), high.astype(np.float32)
-    if not (np.abs(low) < _LARGEST_BOUND).all() or not (np.abs(high) < _LARGEST_BOUND).all():
+    if not (np.abs(low) < LARGEST_BOUND).all() or not (np.abs(high) < LARGEST_BOUND).all():
         raise ValueError(_unbounded(name, f"{low.tolist()} to {high.tolist()}"))
     if not (low < high).all():
         raise ValueError(f"{name} has empty action bounds: {low.tolist()} to {high.tolist()}")
