@@ -15,7 +15,7 @@ from torchrl.envs import GymWrapper
 
 from torchrl_l1.control import L1Config
 from torchrl_l1.deployment import RobustController, environment_source, load_target
-from torchrl_l1.deployment.robust_controller import check_replaces, source_for
+from torchrl_l1.deployment.robust_controller import source_for
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig
 from torchrl_l1.envs import make_env
 from torchrl_l1.experiment.run import run
@@ -42,13 +42,6 @@ def test_what_is_saved_acts_the_same(robust, policy_file, tmp_path):
         load_target(str(tmp_path))
 
 
-@pytest.mark.parametrize("content", ["[]", "3", "{}", '{"format": 1}', "{", '{"format": 7}', ""])
-def test_a_damaged_controller_is_named(content, tmp_path):
-    (tmp_path / "controller.json").write_text(content)
-    with pytest.raises(ValueError, match=r"controller\.json (is damaged|has the format)"):
-        RobustController.load(tmp_path)
-
-
 def test_files_of_one_name_do_not_overwrite_each_other(robust, tmp_path):
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
@@ -60,22 +53,6 @@ def test_files_of_one_name_do_not_overwrite_each_other(robust, tmp_path):
     saved = replace(robust, origin=origin).save(tmp_path / "controller")
     assert (saved / "policy_model.safetensors").read_text() == "a"
     assert (saved / "weights_model.safetensors").read_text() == "b"
-
-
-def test_other_weights_make_another_policy(robust, policy_file, tmp_path, monkeypatch):
-    for name in ("a.pt", "b.pt"):
-        torch.save({"weight": torch.ones(1, 4), "bias": torch.ones(1)}, tmp_path / name)
-    monkeypatch.chdir(tmp_path)
-    source = environment_source("inverted_pendulum")
-    origin = {"policy": "own_policy.py:network", "weights": "a.pt"}
-    replace(robust, source=source, origin=origin).save("controller")
-    folder, name = Path("controller"), "own_policy.py:network"
-    check_replaces(folder, "inverted_pendulum", name, None, str(tmp_path / "a.pt"))
-    for weights in ("b.pt", None):
-        with pytest.raises(ValueError, match=r"holds .*own_policy\.py:network with"):
-            check_replaces(folder, "inverted_pendulum", name, None, weights)
-    RobustController.load("controller").save("again")
-    check_replaces(Path("again"), "inverted_pendulum", name, None, "a.pt")
 
 
 def test_files_of_policies_go_into_the_folder(robust, tmp_path):

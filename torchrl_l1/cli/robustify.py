@@ -13,7 +13,8 @@ import wandb
 from torchrl_l1.checks import check_count
 from torchrl_l1.cli.evaluate import Gathered
 from torchrl_l1.deployment import Assessment, RobustController, robustify
-from torchrl_l1.deployment.robust_controller import PRESETS, check_replaces
+from torchrl_l1.deployment.controller_folder import check_replaces
+from torchrl_l1.deployment.robust_controller import PRESETS
 from torchrl_l1.envs import DISTURBANCES, SUITES, environment_source
 from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run

@@ -18,6 +18,16 @@ from torchrl_l1.atomic import write_atomically
 from torchrl_l1.checks import check_choice, check_count
 from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.deployment.assessment import Assessment, Disturbances, assess
+from torchrl_l1.deployment.controller_folder import (
+    FILE,
+    FORMAT,
+    MODEL,
+    check_runs_nothing,
+    copied,
+    given_by,
+    placed,
+    read_controller,
+)
 from torchrl_l1.deployment.learning import policy_transforms
 from torchrl_l1.deployment.policies import Policy, load_policy
 from torchrl_l1.dynamics import EnsembleDynamics
@@ -26,17 +36,12 @@ from torchrl_l1.envs.references import folders_of
 from torchrl_l1.envs.sources import MakeEnv
 from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
-from torchrl_l1.experiment.files import read_text
 from torchrl_l1.experiment.l1_options import OFF, closest_option, l1_option
 from torchrl_l1.experiment.run_directory import RunDirectory, read_config
 from torchrl_l1.experiment.settings import l1_config
 
 PRESETS = ("robust", "paper")
 """Settings of L1 that a policy can be given, the default first."""
-
-_FORMAT = 1
-_MOST_BYTES = 1_000_000
-_FILE, _MODEL = "controller.json", "model.safetensors"
 
 
 @dataclass
@@ -151,10 +156,10 @@ class RobustController:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         files = (self.origin.get(name) for name in ("policy", "normalization", "weights"))
-        origin = {"given": _given(*files), **self.origin}
+        origin = {"given": given_by(*files), **self.origin}
         kind, _, file = str(origin.get("policy") or "").partition(":")
         if kind in ("sb3", "torchscript", "onnx"):
-            origin["policy"] = f"{kind}:{_copied(Path(file), folder, 'policy')}"
+            origin["policy"] = f"{kind}:{copied(Path(file), folder, 'policy')}"
         named = [name for name in (self.source.name, origin.get("policy")) if name]
         folders = [*(origin.get("search_path") or ()), *folders_of(named, [Path.cwd()])]
         origin["search_path"] = list(dict.fromkeys(folders))
@@ -162,16 +167,16 @@ class RobustController:
             origin["policy"] = str(Path(origin["policy"]).resolve())
         for name in ("normalization", "weights"):
             if origin.get(name) and Path(origin[name]).is_file():
-                origin[name] = _copied(Path(origin[name]), folder, name)
+                origin[name] = copied(Path(origin[name]), folder, name)
         stored = {
-            "format": _FORMAT,
+            "format": FORMAT,
             "environment": self.source.name,
             **origin,
             "preset": self.preset,
             "configs": {name: asdict(config) for name, config in self.configs.items()},
         }
-        self.model.save(folder / _MODEL)
-        write_atomically(folder / _FILE, json.dumps(stored, indent=2) + "\n")
+        self.model.save(folder / MODEL)
+        write_atomically(folder / FILE, json.dumps(stored, indent=2) + "\n")
         return folder
 
     @classmethod
@@ -198,11 +203,11 @@ class RobustController:
                 are not given again.
         """
         folder = Path(folder)
-        if not (folder / _FILE).exists():
-            raise FileNotFoundError(f"{folder} holds no controller: there is no {_FILE}")
-        stored, configs = _read(folder / _FILE)
+        if not (folder / FILE).exists():
+            raise FileNotFoundError(f"{folder} holds no controller: there is no {FILE}")
+        stored, configs = read_controller(folder / FILE)
         if not trusted:
-            _check_runs_nothing(folder, stored)
+            check_runs_nothing(folder, stored)
         for what, value in (("make_env", make_env), ("policy", policy)):
             if value is None and not stored["environment" if what == "make_env" else what]:
                 raise ValueError(f"{folder} names no {what}, which was an object: give it again")
@@ -212,7 +217,7 @@ class RobustController:
         names = {key: stored.get(key) for key in ("policy", "normalization", "weights")}
         origin: dict[str, Any] = {"search_path": list(dict.fromkeys(search_path))}
         if policy is None:
-            found = {key: _placed(value, folder) for key, value in names.items()}
+            found = {key: placed(value, folder) for key, value in names.items()}
             policy, given = found.pop("policy"), found
             origin["given"] = stored.get("given")
         else:
@@ -223,7 +228,7 @@ class RobustController:
         return cls(
             source,
             load_policy(policy, source.one(), **given, search_path=search_path),
-            EnsembleDynamics.load(folder / _MODEL),
+            EnsembleDynamics.load(folder / MODEL),
             configs,
             stored["preset"],
             {"policy": policy if isinstance(policy, str) else None, **given, **origin},
@@ -243,91 +248,6 @@ def source_for(
         return environment_source(make_env, search_path)
     source = environment_source(make_env, settings.get("search_path") or ())
     return replace(source, observation_keys=tuple(settings.get("observation_keys") or ()))
-
-
-def _copied(file: Path, folder: Path, role: str) -> str:
-    """Put a copy of a file into a folder, unless it is that of the folder; its name there."""
-    # With its role, since files of different folders may have one name.
-    target = folder / (file.name if file.name.startswith(role) else f"{role}_{file.name}")
-    if file.resolve() != target.resolve():
-        write_atomically(target, file.read_bytes())
-    return target.name
-
-
-def _read(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
-    """What a controller's file holds, and its settings of L1."""
-    try:
-        stored = json.loads(read_text(file, _MOST_BYTES))
-        if stored["format"] == _FORMAT:
-            names = [stored[name] for name in ("environment", "policy", "preset")]
-            names += [stored.get(name) for name in ("normalization", "weights")]
-            names += stored.get("search_path") or ()
-            if not all(name is None or isinstance(name, str) for name in names):
-                raise TypeError("a name in it is no text")
-            configs = {name: L1Config(**values) for name, values in stored["configs"].items()}
-            _ = configs[stored["preset"]]
-            return stored, configs
-    except (
-        AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError
-    ) as error:  # fmt: skip
-        raise ValueError(f"{file} is damaged ({error!r}): robustify the policy again") from error
-    raise ValueError(
-        f"{file} has the format {stored['format']!r}, and this version reads {_FORMAT}: robustify "
-        "the policy again"
-    )
-
-
-def check_replaces(
-    folder: Path,
-    environment: str,
-    policy: str,
-    normalization: str | None = None,
-    weights: str | None = None,
-) -> None:
-    """Refuse a folder with the controller of another policy or environment.
-
-    Raises:
-        ValueError: naming what it holds.
-    """
-    try:
-        stored, _ = _read(folder / _FILE)
-    except (FileNotFoundError, ValueError):  # nothing that is of use
-        return
-    held = (stored["environment"], stored.get("given"))
-    if held[1] is not None and held != (environment, _given(policy, normalization, weights)):
-        raise ValueError(
-            f"{folder} holds the controller of {held[1]} in {held[0]}: give another --output, or "
-            "remove it"
-        )
-
-
-def _given(policy: str | None, *files: str | None) -> str | None:
-    """What names a policy, with the files that belong to it; ``None`` for an object."""
-    named = [policy, *files] if policy else []
-    return " with ".join(_whole(name) for name in named if name) or None
-
-
-def _whole(name: str) -> str:
-    """A name with the whole path of the file or folder in it."""
-    for part in (name, *name.split(":", 1)):
-        if part and Path(part).exists():
-            return name.replace(part, str(Path(part).resolve()))
-    return name
-
-
-def _check_runs_nothing(folder: Path, stored: dict[str, Any]) -> None:
-    for what, data in (("environment", ()), ("policy", ("torchscript", "onnx"))):
-        source = str(stored[what] or "")
-        if ":" in source and source.partition(":")[0] not in data:
-            raise ValueError(
-                f"{folder} names {source!r}, which would be run: say --trust if the folder is yours"
-            )
-
-
-def _placed(name: str | None, folder: Path) -> str | None:
-    """Where a file lies whose name a controller holds."""
-    kind, colon, file = (name or "").rpartition(":")
-    return f"{kind}{colon}{folder / file}" if name and (folder / file).is_file() else name
 
 
 def load_target(
@@ -355,7 +275,7 @@ def load_target(
         if policy is not None:
             raise ValueError(f"{target} has a policy of its own: leave --policy out")
         for place in (folder, folder / "controller"):
-            if (place / _FILE).exists():
+            if (place / FILE).exists():
                 return RobustController.load(place, trusted=trusted)
         return _of_run(folder)
     if kept_by(folder) and folder.is_file():

@@ -1,0 +1,114 @@
+"""The folder of a robust controller: what it holds, and what is named in it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from torchrl_l1.atomic import write_atomically
+from torchrl_l1.control import L1Config
+from torchrl_l1.experiment.files import read_text
+
+FILE, MODEL = "controller.json", "model.safetensors"
+"""Names of its files: settings, and the model."""
+
+FORMAT = 1
+"""Of the settings."""
+
+_MOST_BYTES = 1_000_000
+
+
+def copied(file: Path, folder: Path, role: str) -> str:
+    """Put a copy of a file into a folder, unless it is that of the folder; its name there."""
+    # With its role, since files of different folders may have one name.
+    target = folder / (file.name if file.name.startswith(role) else f"{role}_{file.name}")
+    if file.resolve() != target.resolve():
+        write_atomically(target, file.read_bytes())
+    return target.name
+
+
+def read_controller(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
+    """What a controller's file holds, and its settings of L1.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: if it is damaged, or of another version.
+    """
+    try:
+        stored = json.loads(read_text(file, _MOST_BYTES))
+        if stored["format"] == FORMAT:
+            names = [stored[name] for name in ("environment", "policy", "preset")]
+            names += [stored.get(name) for name in ("normalization", "weights")]
+            names += stored.get("search_path") or ()
+            if not all(name is None or isinstance(name, str) for name in names):
+                raise TypeError("a name in it is no text")
+            configs = {name: L1Config(**values) for name, values in stored["configs"].items()}
+            _ = configs[stored["preset"]]
+            return stored, configs
+    except (
+        AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError
+    ) as error:  # fmt: skip
+        raise ValueError(f"{file} is damaged ({error!r}): robustify the policy again") from error
+    raise ValueError(
+        f"{file} has the format {stored['format']!r}, and this version reads {FORMAT}: robustify "
+        "the policy again"
+    )
+
+
+def check_replaces(
+    folder: Path,
+    environment: str,
+    policy: str,
+    normalization: str | None = None,
+    weights: str | None = None,
+) -> None:
+    """Refuse a folder with the controller of another policy or environment.
+
+    Raises:
+        ValueError: naming what it holds.
+    """
+    try:
+        stored, _ = read_controller(folder / FILE)
+    except (FileNotFoundError, ValueError):  # nothing that is of use
+        return
+    held = (stored["environment"], stored.get("given"))
+    if held[1] is not None and held != (environment, given_by(policy, normalization, weights)):
+        raise ValueError(
+            f"{folder} holds the controller of {held[1]} in {held[0]}: give another --output, or "
+            "remove it"
+        )
+
+
+def given_by(policy: str | None, *files: str | None) -> str | None:
+    """What names a policy, with the files that belong to it; ``None`` for an object."""
+    named = [policy, *files] if policy else []
+    return " with ".join(_whole(name) for name in named if name) or None
+
+
+def _whole(name: str) -> str:
+    """A name with the whole path of the file or folder in it."""
+    for part in (name, *name.split(":", 1)):
+        if part and Path(part).exists():
+            return name.replace(part, str(Path(part).resolve()))
+    return name
+
+
+def check_runs_nothing(folder: Path, stored: dict[str, Any]) -> None:
+    """Refuse a controller whose environment or policy is code, or a pickle.
+
+    Raises:
+        ValueError: naming it.
+    """
+    for what, data in (("environment", ()), ("policy", ("torchscript", "onnx"))):
+        source = str(stored[what] or "")
+        if ":" in source and source.partition(":")[0] not in data:
+            raise ValueError(
+                f"{folder} names {source!r}, which would be run: say --trust if the folder is yours"
+            )
+
+
+def placed(name: str | None, folder: Path) -> str | None:
+    """Where a file lies whose name a controller holds."""
+    kind, colon, file = (name or "").rpartition(":")
+    return f"{kind}{colon}{folder / file}" if name and (folder / file).is_file() else name
