@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,13 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import GymWrapper
 
 from torchrl_l1.control import L1Config
-from torchrl_l1.deployment import RobustController, environment_source, load_target
+from torchrl_l1.deployment import (
+    RobustController,
+    environment_source,
+    load_target,
+    robust_controller,
+    robustify,
+)
 from torchrl_l1.deployment.robust_controller import source_for
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig
 from torchrl_l1.envs import make_env
@@ -40,6 +47,37 @@ def test_what_is_saved_acts_the_same(robust, policy_file, tmp_path):
     assert load_target(str(tmp_path), trusted=True).configs == robust.configs
     with pytest.raises(ValueError, match="say --trust"):
         load_target(str(tmp_path))
+
+
+def test_files_of_two_saves_are_no_controller(robust, tmp_path, monkeypatch):
+    folder = robust.save(tmp_path)
+    other = copy.deepcopy(robust.model)
+    for parameter in other.parameters():
+        parameter.data.mul_(2)
+    second = replace(robust, model=other)
+    with monkeypatch.context() as broken_off:
+        broken_off.setattr(robust_controller, "write_atomically", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            second.save(folder)
+    with pytest.raises(
+        ValueError, match=r"model\.safetensors is not the one that controller\.json"
+    ):
+        RobustController.load(folder, policy=balance)
+    second.save(folder)
+    assert RobustController.load(folder, policy=balance).preset == "robust"
+
+
+@pytest.mark.filterwarnings("ignore:the model is too poor")
+def test_code_that_has_changed_since_is_told(policy_file, tmp_path):
+    name = f"{policy_file}:balance"
+    made = robustify("inverted_pendulum", name, 60, fit=QUICK, **TINY)
+    before = policy_file.read_text()
+    policy_file.write_text(before.replace("1.0, 10.0", "-1.0, -10.0"))
+    folder = made.save(tmp_path / "controller")
+    with pytest.warns(UserWarning, match=r"own_policy\.py changed since the controller"):
+        changed = RobustController.load(folder)
+    changed.save(folder)
+    assert RobustController.load(folder).preset == "robust"
 
 
 def test_files_of_one_name_do_not_overwrite_each_other(robust, tmp_path):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from torchrl_l1.atomic import write_atomically
 from torchrl_l1.control import L1Config
+from torchrl_l1.envs import code_digests, file_digest
 from torchrl_l1.experiment.files import read_text
 
 FILE, MODEL = "controller.json", "model.safetensors"
@@ -15,6 +17,9 @@ FILE, MODEL = "controller.json", "model.safetensors"
 
 FORMAT = 1
 """Of the settings."""
+
+FILES = ("sb3", "torchscript", "onnx")
+"""Kinds of policies that are files."""
 
 _MOST_BYTES = 1_000_000
 
@@ -41,6 +46,8 @@ def read_controller(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
             names = [stored[name] for name in ("environment", "policy", "preset")]
             names += [stored.get(name) for name in ("normalization", "weights")]
             names += stored.get("search_path") or ()
+            for digests in (stored.get("files") or {}, stored.get("code") or {}):
+                names += [*digests.keys(), *digests.values()]
             if not all(name is None or isinstance(name, str) for name in names):
                 raise TypeError("a name in it is no text")
             configs = {name: L1Config(**values) for name, values in stored["configs"].items()}
@@ -54,6 +61,26 @@ def read_controller(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
         f"{file} has the format {stored['format']!r}, and this version reads {FORMAT}: robustify "
         "the policy again"
     )
+
+
+def check_files(folder: Path, digests: Mapping[str, str]) -> None:
+    """Refuse files that are not those which the settings were written with.
+
+    Raises:
+        ValueError: naming the first.
+    """
+    for name, known in digests.items():
+        file = folder / name
+        if file.is_file() and file_digest(file) != known:
+            raise ValueError(
+                f"{file} is not the one that {FILE} was written with: robustify the policy again"
+            )
+
+
+def code_of(names: Iterable[object], search_path: Sequence[str]) -> dict[str, str]:
+    """Digests of the files and modules that environment and policy are named by."""
+    texts = (name for name in names if isinstance(name, str))
+    return code_digests([n for n in texts if n.partition(":")[0] not in FILES], search_path)
 
 
 def check_replaces(

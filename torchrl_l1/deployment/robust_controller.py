@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -20,9 +21,12 @@ from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.deployment.assessment import Assessment, Disturbances, assess
 from torchrl_l1.deployment.controller_folder import (
     FILE,
+    FILES,
     FORMAT,
     MODEL,
+    check_files,
     check_runs_nothing,
+    code_of,
     copied,
     given_by,
     placed,
@@ -36,6 +40,7 @@ from torchrl_l1.envs.references import folders_of
 from torchrl_l1.envs.sources import MakeEnv
 from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
+from torchrl_l1.experiment.files import digest
 from torchrl_l1.experiment.l1_options import OFF, closest_option, l1_option
 from torchrl_l1.experiment.run_directory import RunDirectory, read_config
 from torchrl_l1.experiment.settings import l1_config
@@ -55,7 +60,7 @@ class RobustController:
         configs: settings of L1 by preset, bounds of the action included.
         preset: the one that acts by default.
         origin: how the policy is found again, with ``search_path``, the folders of what
-            policy and environment are named by.
+            policy and environment are named by, and ``code``, digests of it.
     """
 
     source: EnvironmentSource
@@ -155,11 +160,13 @@ class RobustController:
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        files = (self.origin.get(name) for name in ("policy", "normalization", "weights"))
-        origin = {"given": given_by(*files), **self.origin}
+        given = (self.origin.get(name) for name in ("policy", "normalization", "weights"))
+        origin = {"given": given_by(*given), **self.origin}
+        files = [MODEL]
         kind, _, file = str(origin.get("policy") or "").partition(":")
-        if kind in ("sb3", "torchscript", "onnx"):
-            origin["policy"] = f"{kind}:{copied(Path(file), folder, 'policy')}"
+        if kind in FILES:
+            files.append(copied(Path(file), folder, "policy"))
+            origin["policy"] = f"{kind}:{files[-1]}"
         named = [name for name in (self.source.name, origin.get("policy")) if name]
         folders = [*(origin.get("search_path") or ()), *folders_of(named, [Path.cwd()])]
         origin["search_path"] = list(dict.fromkeys(folders))
@@ -168,14 +175,16 @@ class RobustController:
         for name in ("normalization", "weights"):
             if origin.get(name) and Path(origin[name]).is_file():
                 origin[name] = copied(Path(origin[name]), folder, name)
+                files.append(origin[name])
+        self.model.save(folder / MODEL)
         stored = {
             "format": FORMAT,
             "environment": self.source.name,
             **origin,
+            "files": {name: digest((folder / name).read_bytes()) for name in files},
             "preset": self.preset,
             "configs": {name: asdict(config) for name, config in self.configs.items()},
         }
-        self.model.save(folder / MODEL)
         write_atomically(folder / FILE, json.dumps(stored, indent=2) + "\n")
         return folder
 
@@ -201,6 +210,11 @@ class RobustController:
                 trusted and names what would be run.
             ValueError: if environment or policy were given as objects, which no folder holds, and
                 are not given again.
+            ValueError: for a file in it that is not the one that was saved with the settings, as
+                after a ``save`` that was broken off.
+
+        Warns:
+            UserWarning: if code that the folder names has changed since.
         """
         folder = Path(folder)
         if not (folder / FILE).exists():
@@ -208,6 +222,7 @@ class RobustController:
         stored, configs = read_controller(folder / FILE)
         if not trusted:
             check_runs_nothing(folder, stored)
+        check_files(folder, stored.get("files") or {})
         for what, value in (("make_env", make_env), ("policy", policy)):
             if value is None and not stored["environment" if what == "make_env" else what]:
                 raise ValueError(f"{folder} names no {what}, which was an object: give it again")
@@ -224,6 +239,15 @@ class RobustController:
             given = {"normalization": None, "weights": None}
         assert policy is not None
         named = stored["environment"] if make_env is None else make_env
+        origin["code"] = code_of((named, policy), search_path)
+        before = stored.get("code") or {}
+        changed = [name for name, code in origin["code"].items() if before.get(name, code) != code]
+        if changed:
+            warnings.warn(
+                f"{', '.join(changed)} changed since the controller {folder} was made: robustify "
+                "the policy again if it acts otherwise",
+                stacklevel=2,
+            )
         source = source_for(named, policy, search_path)
         return cls(
             source,
@@ -305,7 +329,9 @@ def _of_run(folder: Path) -> RobustController:
         configs[name] = config
     policy = list(run.algorithm.policies.values())[-1]
     model = run.algorithm.acting_dynamics
-    origin = {"policy": str(folder), "search_path": list(run.recipe.search_path)}
+    search_path = list(run.recipe.search_path)
+    code = code_of([run.recipe.task], search_path)
+    origin = {"policy": str(folder), "search_path": search_path, "code": code}
     source = environment_source(run.recipe.task, run.recipe.search_path)
     source = replace(source, observation_keys=tuple(run.recipe.observation_keys))
     preset = trained_with if trained_with in PRESETS else PRESETS[0]
