@@ -111,6 +111,26 @@ def test_files_of_policies_go_into_the_folder(robust, tmp_path):
     assert RobustController.load(moved).policy.rows is False
 
 
+def test_a_model_of_several_files_goes_into_the_folder_whole(robust, tmp_path):
+    onnx = pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    gain = onnx.numpy_helper.from_array(np.array([[1.0], [10.0], [1.0], [2.0]], np.float32), "gain")
+    make, kind = onnx.helper, onnx.TensorProto.FLOAT
+    x, u = (make.make_tensor_value_info(name, kind, ["N", n]) for name, n in (("x", 4), ("u", 1)))
+    graph = make.make_graph([make.make_node("MatMul", ["x", "gain"], ["u"])], "g", [x], [u], [gain])
+    model = make.make_model(graph, opset_imports=[make.make_opsetid("", 13)], ir_version=8)
+    file = tmp_path / "policy.onnx"
+    onnx.save_model(
+        model, str(file), save_as_external_data=True, location="weights.bin", size_threshold=0
+    )
+    folder = replace(robust, origin={"policy": f"onnx:{file}"}).save(tmp_path / "controller")
+    for name in ("policy.onnx", "weights.bin"):
+        (tmp_path / name).unlink()
+    observation = torch.full((2, 4), 0.1)
+    action = RobustController.load(folder).policy(TensorDict(observation=observation))["action"]
+    torch.testing.assert_close(action, balance(observation))
+
+
 def test_what_is_named_is_found_from_any_folder(robust, policy_file, tmp_path, monkeypatch):
     """Another file of that name, where the controller is used, is another policy."""
     monkeypatch.chdir(tmp_path)

@@ -10,6 +10,7 @@ from typing import Any
 from torchrl_l1.atomic import write_atomically
 from torchrl_l1.control import L1Config
 from torchrl_l1.envs import code_digests, file_digest
+from torchrl_l1.envs.references import require
 from torchrl_l1.experiment.files import read_text
 
 FILE, MODEL = "controller.json", "model.safetensors"
@@ -24,12 +25,18 @@ FILES = ("sb3", "torchscript", "onnx")
 _MOST_BYTES = 1_000_000
 
 
-def copied(file: Path, folder: Path, role: str) -> str:
-    """Put a copy of a file into a folder, unless it is that of the folder; its name there."""
+def copied(file: Path, folder: Path, role: str, kind: str = "") -> str:
+    """Put a copy of a file into a folder, unless it is that of the folder; its name there.
+
+    A model of the kind ``onnx`` has in it what it kept in other files.
+    """
     # With its role, since files of different folders may have one name.
     target = folder / (file.name if file.name.startswith(role) else f"{role}_{file.name}")
     if file.resolve() != target.resolve():
-        write_atomically(target, file.read_bytes())
+        content = file.read_bytes()
+        if kind == "onnx" and b"location" in content:  # by which it names other files
+            content = require("onnx", "onnx").load(str(file)).SerializeToString()
+        write_atomically(target, content)
     return target.name
 
 

@@ -165,7 +165,7 @@ class RobustController:
         files = [MODEL]
         kind, _, file = str(origin.get("policy") or "").partition(":")
         if kind in FILES:
-            files.append(copied(Path(file), folder, "policy"))
+            files.append(copied(Path(file), folder, "policy", kind))
             origin["policy"] = f"{kind}:{files[-1]}"
         named = [name for name in (self.source.name, origin.get("policy")) if name]
         folders = [*(origin.get("search_path") or ()), *folders_of(named, [Path.cwd()])]
