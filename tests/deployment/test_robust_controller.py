@@ -223,5 +223,40 @@ def test_a_wrapped_environment_has_the_parts_in_that_order_too():
 def test_targets_that_are_none(tmp_path):
     with pytest.raises(ValueError, match="there is no folder"):
         load_target("gymnasium/Pendulum-v1")
-    with pytest.raises(ValueError, match="leave --policy out"):
-        load_target(str(tmp_path), policy="sb3:x.zip")
+
+
+@pytest.mark.parametrize("name", ["policy", "normalization", "weights"])
+def test_what_a_target_has_of_its_own_is_not_given_beside_it(name, tmp_path):
+    kept = tmp_path / "checkpoints" / "best.pt"
+    kept.parent.mkdir()
+    kept.touch()
+    for target in (tmp_path, kept):
+        with pytest.raises(ValueError, match=f"has a policy of its own: leave --{name} out"):
+            load_target(str(target), **{name: "none"})
+
+
+def test_code_that_a_run_names_is_not_run_without_trust(robust, tiny_recipe, tmp_path):
+    code = "def reward(x, u, y):\n    return x[..., 0]\n"
+    (tmp_path / "mine.py").write_text(code)
+    folder = run(
+        tiny_recipe(
+            "outer_iterations=1", "checkpoint.every=1",
+            "reward=mine.py:reward", f"search_path=[{tmp_path}]",
+        )
+    )  # fmt: skip
+    (tmp_path / "mine.py").write_text(f"import os\nos.mkdir({str(tmp_path / 'ran')!r})\n{code}")
+    kept = folder / "checkpoints" / "after_1.pt"
+    named = replace(robust, origin={"policy": str(folder)}).save(tmp_path / "controller")
+    beside = replace(robust, origin={"policy": "checkpoints/after_1.pt"}).save(tmp_path / "beside")
+    for target in (folder, kept, named):
+        with pytest.raises(ValueError, match=r"names 'mine\.py:reward', which would be run"):
+            load_target(str(target))
+    with pytest.raises(ValueError, match=r"names 'mine\.py:reward', which would be run"):
+        load_target("inverted_pendulum", policy=str(folder))
+    for file in beside.iterdir():
+        file.rename(folder / file.name)
+    with pytest.raises(ValueError, match=r"names 'mine\.py:reward', which would be run"):
+        load_target(str(folder))
+    assert not (tmp_path / "ran").exists()
+    load_target(str(kept), trusted=True)
+    assert (tmp_path / "ran").exists()

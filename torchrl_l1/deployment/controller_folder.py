@@ -9,9 +9,13 @@ from typing import Any
 
 from torchrl_l1.atomic import write_atomically
 from torchrl_l1.control import L1Config
+from torchrl_l1.deployment.policies import Policy
 from torchrl_l1.envs import code_digests, file_digest
 from torchrl_l1.envs.references import require
+from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.files import read_text
+from torchrl_l1.experiment.run_directory import RunDirectory, read_config
+from torchrl_l1.experiment.settings import NAMING_KEYS
 
 FILE, MODEL = "controller.json", "model.safetensors"
 """Names of its files: settings, and the model."""
@@ -134,12 +138,34 @@ def check_runs_nothing(folder: Path, stored: dict[str, Any]) -> None:
     Raises:
         ValueError: naming it.
     """
-    for what, data in (("environment", ()), ("policy", ("torchscript", "onnx"))):
-        source = str(stored[what] or "")
-        if ":" in source and source.partition(":")[0] not in data:
+    _refuse_code(folder, [stored["environment"]])
+    _refuse_code(folder, [stored["policy"]], ("torchscript", "onnx"))
+    check_run_names_nothing(placed(stored["policy"], folder))
+
+
+def check_run_names_nothing(policy: Policy | None) -> None:
+    """Refuse a run whose settings name code; what is no run passes.
+
+    Raises:
+        ValueError: naming it.
+    """
+    settings = settings_of_run(policy)
+    _refuse_code(policy, [settings.get(key) for key in NAMING_KEYS])
+
+
+def _refuse_code(where: object, names: Iterable[object], data: Sequence[str] = ()) -> None:
+    for name in map(str, names):
+        if ":" in name and name.partition(":")[0] not in data:
             raise ValueError(
-                f"{folder} names {source!r}, which would be run: say --trust if the folder is yours"
+                f"{where} names {name!r}, which would be run: say --trust if the folder is yours"
             )
+
+
+def settings_of_run(policy: Policy | None) -> dict[str, Any]:
+    """The settings of the run that a policy is from; none if it is from elsewhere."""
+    run = Path(policy) if isinstance(policy, str) else None
+    config = None if run is None else RunDirectory(kept_by(run) or run).config_file
+    return {} if config is None or not config.is_file() else read_config(config)
 
 
 def placed(name: str | None, folder: Path) -> str | None:

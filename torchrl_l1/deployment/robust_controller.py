@@ -25,12 +25,14 @@ from torchrl_l1.deployment.controller_folder import (
     FORMAT,
     MODEL,
     check_files,
+    check_run_names_nothing,
     check_runs_nothing,
     code_of,
     copied,
     given_by,
     placed,
     read_controller,
+    settings_of_run,
 )
 from torchrl_l1.deployment.learning import policy_transforms
 from torchrl_l1.deployment.policies import Policy, load_policy
@@ -42,7 +44,6 @@ from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.files import digest
 from torchrl_l1.experiment.l1_options import OFF, closest_option, l1_option
-from torchrl_l1.experiment.run_directory import RunDirectory, read_config
 from torchrl_l1.experiment.settings import l1_config
 
 PRESETS = ("robust", "paper")
@@ -104,8 +105,10 @@ class RobustController:
         """The settings of a preset; those that act by default if ``None``.
 
         Raises:
-            ValueError: for a preset that there is not.
+            ValueError: for a preset that there is not, or where there is no L1.
         """
+        if not self.configs:
+            raise ValueError("a policy in an environment has no L1: robustify it first")
         name = self.preset if preset is None else preset
         check_choice("preset", name, tuple(self.configs))
         return self.configs[name]
@@ -263,11 +266,7 @@ def source_for(
     make_env: MakeEnv, policy: Policy, search_path: Sequence[str] = ()
 ) -> EnvironmentSource:
     """The environment, with the parts of its observation in the order of a run's policy."""
-    run = Path(policy) if isinstance(policy, str) else None
-    config = None if run is None else RunDirectory(kept_by(run) or run).config_file
-    if config is None or not config.is_file():
-        return environment_source(make_env, search_path)
-    settings = read_config(config)
+    settings = settings_of_run(policy)
     if make_env != settings.get("task"):
         return environment_source(make_env, search_path)
     source = environment_source(make_env, settings.get("search_path") or ())
@@ -289,26 +288,32 @@ def load_target(
         policy: the policy in that environment, which then has no L1.
         normalization: see :func:`load_policy`.
         weights: likewise.
-        trusted: see :meth:`RobustController.load`.
+        trusted: whether functions and pickles that a folder names may be run, those of a run in its
+            settings; what is named here is run in any case.
 
     Raises:
-        ValueError: if it is none of them, or a policy is given beside a folder.
+        ValueError: if it is none of them, a policy or a file of one is given beside a folder, or a
+            folder that is not to be trusted names what would be run.
     """
     folder = Path(target)
-    if folder.is_dir():
-        if policy is not None:
-            raise ValueError(f"{target} has a policy of its own: leave --policy out")
+    if folder.is_dir() or (kept_by(folder) and folder.is_file()):
+        given = {"policy": policy, "normalization": normalization, "weights": weights}
+        for name, value in given.items():
+            if value is not None:
+                raise ValueError(f"{target} has a policy of its own: leave --{name} out")
         for place in (folder, folder / "controller"):
             if (place / FILE).exists():
                 return RobustController.load(place, trusted=trusted)
-        return _of_run(folder)
-    if kept_by(folder) and folder.is_file():
+        if not trusted:
+            check_run_names_nothing(target)
         return _of_run(folder)
     if policy is None:
         raise ValueError(
             f"there is no folder {target}; give a controller, a run directory, or an environment "
             "with --policy"
         )
+    if not trusted:
+        check_run_names_nothing(policy)
     source = source_for(target, policy)
     acting = load_policy(policy, source.one(), normalization, weights)
     return RobustController(source, acting, EnsembleDynamics(1, 1, hidden=()), {}, OFF)
