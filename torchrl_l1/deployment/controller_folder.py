@@ -27,6 +27,7 @@ FILES = ("sb3", "torchscript", "onnx")
 """Kinds of policies that are files."""
 
 _MOST_BYTES = 1_000_000
+_WITH = " with "
 
 
 def copied(file: Path, folder: Path, role: str, kind: str = "") -> str:
@@ -118,10 +119,27 @@ def check_replaces(
         )
 
 
+def check_spares(origin: Mapping[str, Any], file: Path) -> None:
+    """Refuse to replace a file that a policy comes from, or one in its run directory.
+
+    Raises:
+        ValueError: naming both.
+    """
+    names = [origin.get(name) for name in ("policy", "normalization", "weights")]
+    for name in filter(None, [*names, *str(origin.get("given") or "").split(_WITH)]):
+        kind, _, rest = name.partition(":")
+        source = Path(rest if kind in FILES else name)
+        place = kept_by(source) or source
+        if file.exists() and file.resolve().is_relative_to(place.resolve()):
+            raise ValueError(
+                f"{file} is there, and the policy comes from {source}: name another file"
+            )
+
+
 def given_by(policy: str | None, *files: str | None) -> str | None:
     """What names a policy, with the files that belong to it; ``None`` for an object."""
     named = [policy, *files] if policy else []
-    return " with ".join(_whole(name) for name in named if name) or None
+    return _WITH.join(_whole(name) for name in named if name) or None
 
 
 def _whole(name: str) -> str:
