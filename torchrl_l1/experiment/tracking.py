@@ -30,8 +30,8 @@ from torchrl_l1.experiment.wandb_files import has_ended, known_id, take_over
 MODES = ("auto", "online", "offline", "disabled")
 
 # What W&B takes from the environment, older words among it.
+_WANDB_MODES = ("online", "offline", "disabled", "shared", "run", "dryrun")
 _ONLINE = ("online", "shared", "run")
-_WANDB_MODES = (*_ONLINE, "offline", "disabled", "dryrun")
 
 LOGGERS = ("wandb", "tensorboard")
 """What a recipe's ``loggers`` may name."""
