@@ -23,7 +23,7 @@ FILE, MODEL = "controller.json", "model.safetensors"
 FORMAT = 1
 """Of the settings."""
 
-FILES = ("sb3", "torchscript", "onnx")
+FILE_KINDS = ("sb3", "torchscript", "onnx")
 """Kinds of policies that are files."""
 
 _MOST_BYTES = 1_000_000
@@ -92,7 +92,7 @@ def check_files(folder: Path, digests: Mapping[str, str]) -> None:
 def code_of(names: Iterable[object], search_path: Sequence[str]) -> dict[str, str]:
     """Digests of the files and modules that environment and policy are named by."""
     texts = (name for name in names if isinstance(name, str))
-    return code_digests([n for n in texts if n.partition(":")[0] not in FILES], search_path)
+    return code_digests([n for n in texts if n.partition(":")[0] not in FILE_KINDS], search_path)
 
 
 def check_replaces(
@@ -128,7 +128,7 @@ def check_spares(origin: Mapping[str, Any], file: Path) -> None:
     names = [origin.get(name) for name in ("policy", "normalization", "weights")]
     for name in filter(None, [*names, *str(origin.get("given") or "").split(_WITH)]):
         kind, _, rest = name.partition(":")
-        source = Path(rest if kind in FILES else name)
+        source = Path(rest if kind in FILE_KINDS else name)
         place = kept_by(source) or source
         if file.exists() and file.resolve().is_relative_to(place.resolve()):
             raise ValueError(

@@ -21,7 +21,7 @@ from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.deployment.assessment import Assessment, Disturbances, assess
 from torchrl_l1.deployment.controller_folder import (
     FILE,
-    FILES,
+    FILE_KINDS,
     FORMAT,
     MODEL,
     check_files,
@@ -167,7 +167,7 @@ class RobustController:
         origin = {"given": given_by(*given), **self.origin}
         files = [MODEL]
         kind, _, file = str(origin.get("policy") or "").partition(":")
-        if kind in FILES:
+        if kind in FILE_KINDS:
             files.append(copied(Path(file), folder, "policy", kind))
             origin["policy"] = f"{kind}:{files[-1]}"
         named = [name for name in (self.source.name, origin.get("policy")) if name]
