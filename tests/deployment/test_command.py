@@ -3,13 +3,18 @@ from __future__ import annotations
 import csv
 import shlex
 from argparse import Namespace
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import wandb
+from tensordict.nn import TensorDictModule
 
 from torchrl_l1.cli import main, robustify
-from torchrl_l1.deployment import robustification
-from torchrl_l1.envs import get_task, suite
+from torchrl_l1.control import L1Config
+from torchrl_l1.deployment import RobustController, robustification
+from torchrl_l1.dynamics import EnsembleDynamics
+from torchrl_l1.envs import environment_source, get_task, suite
 from torchrl_l1.experiment.evaluate import TrainedRun
 from torchrl_l1.experiment.settings import METRPORecipe
 from torchrl_l1.experiment.tracking import Evaluated
@@ -108,6 +113,57 @@ def test_what_cannot_be_tested_is_refused_before_data_are_collected(
     env = "gymnasium/Pendulum-v1" if options == ["--mass", "2"] else "inverted_pendulum"
     policy = f"{policy_file}:balance"
     assert message in refused(["robustify", env, "--policy", policy, *options], capsys)
+
+
+@pytest.mark.parametrize(
+    "name", ["README.md", "evaluation.csv", "episodes.csv", "evaluation.png", "controller"]
+)
+def test_no_file_of_the_user_s_is_replaced(name, policy_file, monkeypatch, capsys):
+    monkeypatch.setattr(robustification, "collect", None)
+    Path(name).write_text("mine")
+    policy = f"{policy_file}:balance"
+    arguments = ["robustify", "inverted_pendulum", "--policy", policy, "--output", "."]
+    printed = refused(arguments, capsys)
+    assert f"{name} is there already: give another --output" in printed or "move it away" in printed
+    assert Path(name).read_text() == "mine"
+
+
+def test_the_printed_use_has_the_parts_of_the_observation_in_the_policy_s_order(
+    tmp_path, monkeypatch
+):
+    file = tmp_path / "envs.py"
+    file.write_text(
+        "import gymnasium\nimport numpy as np\nfrom gymnasium.spaces import Box, Dict\n\n\n"
+        "class Parts(gymnasium.Env):\n"
+        "    action_space = Box(-1, 1, (1,))\n"
+        "    observation_space = Dict(place=Box(-9, 9, (1,)), speed=Box(-9, 9, (1,)))\n"
+        "    seen = dict(place=np.ones(1, np.float32), speed=np.full(1, -7, np.float32))\n\n"
+        "    def reset(self, *, seed=None, options=None):\n"
+        "        return self.seen, {}\n"
+    )
+    source = environment_source(f"{file}:Parts")
+    robust = RobustController(
+        replace(source, observation_keys=("speed", "place")),
+        TensorDictModule(lambda x: x[..., :1], ["observation"], ["action"]),
+        EnsembleDynamics(2, 1, hidden=(4,)),
+        {"robust": L1Config.robust(0.05)},
+    )
+    monkeypatch.setattr(RobustController, "load", lambda folder: robust)
+    names: dict[str, object] = {}
+    exec(robustify.usage_lines(tmp_path).partition("data =")[0], names)
+    assert names["env"].reset()["observation"].tolist() == [-7.0, 1.0]
+
+
+def test_what_weights_and_biases_refuses_costs_no_result(robust, monkeypatch, capsys):
+    def init(**options):
+        raise wandb.errors.UsageError("api_key not configured")
+
+    monkeypatch.setattr(wandb, "init", init)
+    monkeypatch.setattr(robustify, "robustify", lambda *_, **__: robust)
+    main(["robustify", "inverted_pendulum", "--policy", "p", "--bias", "1", "--episodes", "1",
+          "--most-steps", "3", "--wandb", "offline", "--output", "out"])  # fmt: skip
+    printed = capsys.readouterr()
+    assert "To use it" in printed.out and "W&B: api_key not configured" in printed.err
 
 
 def test_what_a_training_s_policy_is_worth_is_logged_to_the_training(tmp_path, monkeypatch):

@@ -3,6 +3,7 @@ from __future__ import annotations
 import sys
 import threading
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -242,6 +243,29 @@ def test_the_place_is_looked_at_before_work(robust, tmp_path, monkeypatch):
     for place in ("file/policy.pt", "folder.pt"):
         with pytest.raises(OSError, match=place.partition(".")[0].split("/")[0]):
             export(robust, tmp_path / place, steps=3)
+
+
+def test_files_of_the_policy_are_not_replaced(robust, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    torch.jit.save(torch.jit.script(torch.nn.Linear(4, 1)), "policy.pt")
+    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+    for name in ("run/checkpoint.pt", "run/checkpoints/best.pt", "before.pt"):
+        (tmp_path / name).touch()
+    given = replace(robust, origin={"policy": "torchscript:policy.pt"})
+    saved = RobustController.load(given.save("controller"))
+    run = replace(robust, origin={"policy": "run"})
+    kept = replace(robust, origin={"policy": "run/checkpoints/best.pt"})
+    weights = replace(robust, origin={"policy": "own.py:network", "weights": "policy.pt"})
+    for one, name in (
+        (given, "policy.pt"), (saved, tmp_path / "policy.pt"), (saved, "controller/policy.pt"),
+        (run, "run/checkpoint.pt"), (kept, "run/checkpoint.pt"), (weights, "policy.pt"),
+    ):  # fmt: skip
+        before = (tmp_path / name).read_bytes()
+        with pytest.raises(ValueError, match=r"the policy comes from .*: name another file"):
+            export(one, name, steps=3)
+        assert (tmp_path / name).read_bytes() == before
+    for name in ("before.pt", "run/robust.pt"):
+        assert export(run, name, steps=3).file.stat().st_size > 0
 
 
 def test_other_suffixes_are_refused(robust, tmp_path):

@@ -71,6 +71,16 @@ def test_the_place_of_a_film_is_looked_at_before_work(tmp_path, monkeypatch, cap
         assert "move it away" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", ["--l1=robust", "--compare"])
+def test_a_policy_in_an_environment_has_no_l1(option, policy_file, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(import_module("torchrl_l1.cli.play"), "film", None)
+    film = str(tmp_path / "film.gif")
+    with pytest.raises(SystemExit):
+        main(["play", "inverted_pendulum", "--policy", f"{policy_file}:balance", option,
+              "--output", film])  # fmt: skip
+    assert "has no L1: robustify it first" in capsys.readouterr().err
+
+
 def test_a_film_of_an_episode(robust):
     try:
         films = [

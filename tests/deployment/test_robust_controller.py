@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -14,8 +15,14 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import GymWrapper
 
 from torchrl_l1.control import L1Config
-from torchrl_l1.deployment import RobustController, environment_source, load_target
-from torchrl_l1.deployment.robust_controller import check_replaces, source_for
+from torchrl_l1.deployment import (
+    RobustController,
+    environment_source,
+    load_target,
+    robust_controller,
+    robustify,
+)
+from torchrl_l1.deployment.robust_controller import source_for
 from torchrl_l1.dynamics import EnsembleDynamics, FitConfig
 from torchrl_l1.envs import make_env
 from torchrl_l1.experiment.run import run
@@ -42,11 +49,35 @@ def test_what_is_saved_acts_the_same(robust, policy_file, tmp_path):
         load_target(str(tmp_path))
 
 
-@pytest.mark.parametrize("content", ["[]", "3", "{}", '{"format": 1}', "{", '{"format": 7}', ""])
-def test_a_damaged_controller_is_named(content, tmp_path):
-    (tmp_path / "controller.json").write_text(content)
-    with pytest.raises(ValueError, match=r"controller\.json (is damaged|has the format)"):
-        RobustController.load(tmp_path)
+def test_files_of_two_saves_are_no_controller(robust, tmp_path, monkeypatch):
+    folder = robust.save(tmp_path)
+    other = copy.deepcopy(robust.model)
+    for parameter in other.parameters():
+        parameter.data.mul_(2)
+    second = replace(robust, model=other)
+    with monkeypatch.context() as broken_off:
+        broken_off.setattr(robust_controller, "write_atomically", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            second.save(folder)
+    with pytest.raises(
+        ValueError, match=r"model\.safetensors is not the one that controller\.json"
+    ):
+        RobustController.load(folder, policy=balance)
+    second.save(folder)
+    assert RobustController.load(folder, policy=balance).preset == "robust"
+
+
+@pytest.mark.filterwarnings("ignore:the model is too poor")
+def test_code_that_has_changed_since_is_told(policy_file, tmp_path):
+    name = f"{policy_file}:balance"
+    made = robustify("inverted_pendulum", name, 60, fit=QUICK, **TINY)
+    before = policy_file.read_text()
+    policy_file.write_text(before.replace("1.0, 10.0", "-1.0, -10.0"))
+    folder = made.save(tmp_path / "controller")
+    with pytest.warns(UserWarning, match=r"own_policy\.py changed since the controller"):
+        changed = RobustController.load(folder)
+    changed.save(folder)
+    assert RobustController.load(folder).preset == "robust"
 
 
 def test_files_of_one_name_do_not_overwrite_each_other(robust, tmp_path):
@@ -60,22 +91,6 @@ def test_files_of_one_name_do_not_overwrite_each_other(robust, tmp_path):
     saved = replace(robust, origin=origin).save(tmp_path / "controller")
     assert (saved / "policy_model.safetensors").read_text() == "a"
     assert (saved / "weights_model.safetensors").read_text() == "b"
-
-
-def test_other_weights_make_another_policy(robust, policy_file, tmp_path, monkeypatch):
-    for name in ("a.pt", "b.pt"):
-        torch.save({"weight": torch.ones(1, 4), "bias": torch.ones(1)}, tmp_path / name)
-    monkeypatch.chdir(tmp_path)
-    source = environment_source("inverted_pendulum")
-    origin = {"policy": "own_policy.py:network", "weights": "a.pt"}
-    replace(robust, source=source, origin=origin).save("controller")
-    folder, name = Path("controller"), "own_policy.py:network"
-    check_replaces(folder, "inverted_pendulum", name, None, str(tmp_path / "a.pt"))
-    for weights in ("b.pt", None):
-        with pytest.raises(ValueError, match=r"holds .*own_policy\.py:network with"):
-            check_replaces(folder, "inverted_pendulum", name, None, weights)
-    RobustController.load("controller").save("again")
-    check_replaces(Path("again"), "inverted_pendulum", name, None, "a.pt")
 
 
 def test_files_of_policies_go_into_the_folder(robust, tmp_path):
@@ -94,6 +109,26 @@ def test_files_of_policies_go_into_the_folder(robust, tmp_path):
     moved = tmp_path / "elsewhere"
     loaded.save(moved)
     assert RobustController.load(moved).policy.rows is False
+
+
+def test_a_model_of_several_files_goes_into_the_folder_whole(robust, tmp_path):
+    onnx = pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    gain = onnx.numpy_helper.from_array(np.array([[1.0], [10.0], [1.0], [2.0]], np.float32), "gain")
+    make, kind = onnx.helper, onnx.TensorProto.FLOAT
+    x, u = (make.make_tensor_value_info(name, kind, ["N", n]) for name, n in (("x", 4), ("u", 1)))
+    graph = make.make_graph([make.make_node("MatMul", ["x", "gain"], ["u"])], "g", [x], [u], [gain])
+    model = make.make_model(graph, opset_imports=[make.make_opsetid("", 13)], ir_version=8)
+    file = tmp_path / "policy.onnx"
+    onnx.save_model(
+        model, str(file), save_as_external_data=True, location="weights.bin", size_threshold=0
+    )
+    folder = replace(robust, origin={"policy": f"onnx:{file}"}).save(tmp_path / "controller")
+    for name in ("policy.onnx", "weights.bin"):
+        (tmp_path / name).unlink()
+    observation = torch.full((2, 4), 0.1)
+    action = RobustController.load(folder).policy(TensorDict(observation=observation))["action"]
+    torch.testing.assert_close(action, balance(observation))
 
 
 def test_what_is_named_is_found_from_any_folder(robust, policy_file, tmp_path, monkeypatch):
@@ -188,5 +223,40 @@ def test_a_wrapped_environment_has_the_parts_in_that_order_too():
 def test_targets_that_are_none(tmp_path):
     with pytest.raises(ValueError, match="there is no folder"):
         load_target("gymnasium/Pendulum-v1")
-    with pytest.raises(ValueError, match="leave --policy out"):
-        load_target(str(tmp_path), policy="sb3:x.zip")
+
+
+@pytest.mark.parametrize("name", ["policy", "normalization", "weights"])
+def test_what_a_target_has_of_its_own_is_not_given_beside_it(name, tmp_path):
+    kept = tmp_path / "checkpoints" / "best.pt"
+    kept.parent.mkdir()
+    kept.touch()
+    for target in (tmp_path, kept):
+        with pytest.raises(ValueError, match=f"has a policy of its own: leave --{name} out"):
+            load_target(str(target), **{name: "none"})
+
+
+def test_code_that_a_run_names_is_not_run_without_trust(robust, tiny_recipe, tmp_path):
+    code = "def reward(x, u, y):\n    return x[..., 0]\n"
+    (tmp_path / "mine.py").write_text(code)
+    folder = run(
+        tiny_recipe(
+            "outer_iterations=1", "checkpoint.every=1",
+            "reward=mine.py:reward", f"search_path=[{tmp_path}]",
+        )
+    )  # fmt: skip
+    (tmp_path / "mine.py").write_text(f"import os\nos.mkdir({str(tmp_path / 'ran')!r})\n{code}")
+    kept = folder / "checkpoints" / "after_1.pt"
+    named = replace(robust, origin={"policy": str(folder)}).save(tmp_path / "controller")
+    beside = replace(robust, origin={"policy": "checkpoints/after_1.pt"}).save(tmp_path / "beside")
+    for target in (folder, kept, named):
+        with pytest.raises(ValueError, match=r"names 'mine\.py:reward', which would be run"):
+            load_target(str(target))
+    with pytest.raises(ValueError, match=r"names 'mine\.py:reward', which would be run"):
+        load_target("inverted_pendulum", policy=str(folder))
+    for file in beside.iterdir():
+        file.rename(folder / file.name)
+    with pytest.raises(ValueError, match=r"names 'mine\.py:reward', which would be run"):
+        load_target(str(folder))
+    assert not (tmp_path / "ran").exists()
+    load_target(str(kept), trusted=True)
+    assert (tmp_path / "ran").exists()

@@ -25,7 +25,14 @@ from torchrl_l1.cli import main
 from torchrl_l1.experiment import tracking
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.tracking import Evaluated, Tracker, log_evaluation, trackers
+from torchrl_l1.experiment.settings import METRPORecipe, WandbSettings
+from torchrl_l1.experiment.tracking import (
+    Evaluated,
+    Tracker,
+    check_wandb_mode,
+    log_evaluation,
+    trackers,
+)
 from torchrl_l1.experiment.wandb_files import ID_FILE, known_id, whole_records
 
 Recipe = Callable[..., DictConfig]
@@ -140,6 +147,35 @@ def test_online_without_a_key_is_a_line_and_leaves_nothing(
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert "wandb.mode=online needs an API key" in line and "wandb login" in line
     assert set(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("mode", ["online", "run"])
+def test_online_by_the_environment_needs_a_key_too(
+    mode: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WANDB_MODE", mode)
+    with pytest.raises(ValueError, match=f"WANDB_MODE={mode} needs an API key"):
+        check_wandb_mode("auto")
+    check_wandb_mode("offline")
+    monkeypatch.setenv("WANDB_API_KEY", "short")
+    with pytest.raises(ValueError, match="W&B: WANDB_API_KEY invalid"):
+        check_wandb_mode("auto")
+
+
+def test_an_evaluation_that_weights_and_biases_refuses_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise wandb.errors.CommError("no network")
+
+    monkeypatch.setattr(tracking, "_used", lambda *_: ["wandb"])
+    monkeypatch.setattr(tracking, "trackers", refuse)
+    for name in ("metrics.csv", "timing.csv", "config.yaml"):
+        (tmp_path / name).touch()
+    recipe = METRPORecipe(wandb=WandbSettings(mode="offline"))
+    said: list[str] = []
+    log_evaluation(recipe, tmp_path, Evaluated("evaluation", []), said.append)
+    assert said == [f"{tmp_path}: evaluation is not logged: no network"]
 
 
 def test_a_mode_of_the_environment_that_there_is_not_is_named(

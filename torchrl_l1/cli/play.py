@@ -50,8 +50,10 @@ def play_command(options: argparse.Namespace) -> None:
     if output is not None:
         make_place(output)
     on = options.l1 or robust.preset
-    if options.compare and on == OFF:
+    if options.compare and options.l1 == OFF:
         raise ValueError("--compare shows L1 off beside L1 on: give --l1 robust, or leave it out")
+    if options.compare or on != OFF:
+        robust.settings(on)
     try:
         films = [
             film(robust, l1, disturbances, steps=options.steps, seed=options.seed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +14,11 @@ import wandb
 from torchrl_l1.checks import check_count
 from torchrl_l1.cli.evaluate import Gathered
 from torchrl_l1.deployment import Assessment, RobustController, robustify
-from torchrl_l1.deployment.robust_controller import PRESETS, check_replaces
+from torchrl_l1.deployment.controller_folder import FILE, check_replaces
+from torchrl_l1.deployment.robust_controller import PRESETS
 from torchrl_l1.envs import DISTURBANCES, SUITES, environment_source
 from torchrl_l1.experiment.checkpoints import kept_by
+from torchrl_l1.experiment.errors import message
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.files import bounded, make_folder, write_atomically, write_table
 from torchrl_l1.experiment.matrix import check_disturbance
@@ -29,6 +32,8 @@ from torchrl_l1.experiment.tracking import (
 from torchrl_l1.experiment.wandb_files import known_id
 
 _PROJECT = "torchrl_l1"
+
+_RESULTS = ("evaluation.csv", "episodes.csv", "evaluation.png", "README.md")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -89,7 +94,9 @@ def robustify_command(options: argparse.Namespace) -> None:
         raise ValueError(f"{output} is a file; choose another --output")
     made_of = (options.env, options.policy, options.normalization, options.weights)
     check_replaces(output / "controller", *made_of)
+    _check_results(output)
     make_folder(output)
+    make_folder(output / "controller")
     robust = robustify(
         options.env,
         options.policy,
@@ -115,13 +122,23 @@ def robustify_command(options: argparse.Namespace) -> None:
     write_table(output / "episodes.csv", table.episodes)
     print(f"\n{table.words}\n\n{table}\n")
     chart = table.plot(output / "evaluation.png")
-    usage = usage_lines(robust, folder)
+    usage = usage_lines(folder)
     write_atomically(output / "README.md", page(options, robust, table, usage))
-    if options.wandb != "disabled":
-        _log(options, table, chart, output)
     print(f"Table: {output / 'evaluation.csv'}, {output / 'episodes.csv'}")
     print(f"Chart: {chart}\nPage: {output / 'README.md'}\nController: {folder}\n")
     print(f"To use it:\n\n{usage}")
+    if options.wandb != "disabled":
+        try:
+            _log(options, table, chart, output)
+        except wandb.errors.Error as error:
+            print(f"W&B: {message(error)}; nothing else is lost", file=sys.stderr)
+
+
+def _check_results(output: Path) -> None:
+    """Refuse a folder with files of the results' names that are none of a controller's."""
+    for name in _RESULTS:
+        if (output / name).exists() and not (output / "controller" / FILE).exists():
+            raise ValueError(f"{output / name} is there already: give another --output")
 
 
 def _check_disturbances(env: str, disturbances: Mapping[str, Sequence[float]]) -> None:
@@ -145,13 +162,12 @@ def _some_biases(robust: RobustController) -> dict[str, list[float]]:
     return {"bias": [round(half * share, 3) for share in (1 / 6, 1 / 3, 1 / 2)]}
 
 
-def usage_lines(robust: RobustController, folder: Path) -> str:
+def usage_lines(folder: Path) -> str:
     """The five lines of Python that load a controller and use it."""
-    name = robust.source.name
     return (
-        "from torchrl_l1.deployment import RobustController, environment_source\n"
+        "from torchrl_l1.deployment import RobustController\n"
         f"robust = RobustController.load({str(folder)!r})\n"
-        f"env = robust.wrap(environment_source({name!r}).one())\n"
+        "env = robust.wrap(robust.source.one())\n"
         "data = env.rollout(1000, robust.policy)\n"
         'data["next", "l1", "u_exec"]  # what L1 sends to the actuators\n'
     )

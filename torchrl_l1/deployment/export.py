@@ -28,6 +28,7 @@ from torchrl_l1.checks import check_choice, check_count
 from torchrl_l1.control import ActionJacobian, L1Config, L1State, L1Transform, augment, init
 from torchrl_l1.control.pipeline import transforms_of
 from torchrl_l1.deployment.assessment import run_episodes
+from torchrl_l1.deployment.controller_folder import check_spares
 from torchrl_l1.deployment.policies import FunctionPolicy
 from torchrl_l1.deployment.robust_controller import RobustController
 from torchrl_l1.deployment.unrolled import UNROLLED
@@ -171,9 +172,9 @@ def export(
 
     Raises:
         OSError: if the file cannot be written there.
-        ValueError: for another format, a policy that is not made of torch's operations, or a
-            difference above the tolerance, or above a hundredth at observations around the recorded
-            ones, as of a policy that decides by values in Python.
+        ValueError: for another format, a file that the policy comes from, a policy that is not
+            made of torch's operations, or a difference above the tolerance, or above a hundredth at
+            observations around the recorded ones, as of a policy that decides by values in Python.
 
     Warns:
         UserWarning: if a trace was made of a policy that looks at values in Python, or the
@@ -186,6 +187,7 @@ def export(
     if format == "onnx":
         for name in ("onnx", "onnxscript", "onnxruntime"):
             require(name, "onnx")
+    check_spares(robust.origin, file)
     make_place(file)
     config, recorded = _recorded(robust, preset, steps, seed)
     steps = len(recorded)  # the episode may end before

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -18,6 +19,21 @@ from torchrl_l1.atomic import write_atomically
 from torchrl_l1.checks import check_choice, check_count
 from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.deployment.assessment import Assessment, Disturbances, assess
+from torchrl_l1.deployment.controller_folder import (
+    FILE,
+    FILE_KINDS,
+    FORMAT,
+    MODEL,
+    check_files,
+    check_run_names_nothing,
+    check_runs_nothing,
+    code_of,
+    copied,
+    given_by,
+    placed,
+    read_controller,
+    settings_of_run,
+)
 from torchrl_l1.deployment.learning import policy_transforms
 from torchrl_l1.deployment.policies import Policy, load_policy
 from torchrl_l1.dynamics import EnsembleDynamics
@@ -26,17 +42,12 @@ from torchrl_l1.envs.references import folders_of
 from torchrl_l1.envs.sources import MakeEnv
 from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
-from torchrl_l1.experiment.files import read_text
+from torchrl_l1.experiment.files import digest
 from torchrl_l1.experiment.l1_options import OFF, closest_option, l1_option
-from torchrl_l1.experiment.run_directory import RunDirectory, read_config
 from torchrl_l1.experiment.settings import l1_config
 
 PRESETS = ("robust", "paper")
 """Settings of L1 that a policy can be given, the default first."""
-
-_FORMAT = 1
-_MOST_BYTES = 1_000_000
-_FILE, _MODEL = "controller.json", "model.safetensors"
 
 
 @dataclass
@@ -50,7 +61,7 @@ class RobustController:
         configs: settings of L1 by preset, bounds of the action included.
         preset: the one that acts by default.
         origin: how the policy is found again, with ``search_path``, the folders of what
-            policy and environment are named by.
+            policy and environment are named by, and ``code``, digests of it.
     """
 
     source: EnvironmentSource
@@ -94,8 +105,10 @@ class RobustController:
         """The settings of a preset; those that act by default if ``None``.
 
         Raises:
-            ValueError: for a preset that there is not.
+            ValueError: for a preset that there is not, or where there is no L1.
         """
+        if not self.configs:
+            raise ValueError("a policy in an environment has no L1: robustify it first")
         name = self.preset if preset is None else preset
         check_choice("preset", name, tuple(self.configs))
         return self.configs[name]
@@ -150,11 +163,13 @@ class RobustController:
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        files = (self.origin.get(name) for name in ("policy", "normalization", "weights"))
-        origin = {"given": _given(*files), **self.origin}
+        given = (self.origin.get(name) for name in ("policy", "normalization", "weights"))
+        origin = {"given": given_by(*given), **self.origin}
+        files = [MODEL]
         kind, _, file = str(origin.get("policy") or "").partition(":")
-        if kind in ("sb3", "torchscript", "onnx"):
-            origin["policy"] = f"{kind}:{_copied(Path(file), folder, 'policy')}"
+        if kind in FILE_KINDS:
+            files.append(copied(Path(file), folder, "policy", kind))
+            origin["policy"] = f"{kind}:{files[-1]}"
         named = [name for name in (self.source.name, origin.get("policy")) if name]
         folders = [*(origin.get("search_path") or ()), *folders_of(named, [Path.cwd()])]
         origin["search_path"] = list(dict.fromkeys(folders))
@@ -162,16 +177,18 @@ class RobustController:
             origin["policy"] = str(Path(origin["policy"]).resolve())
         for name in ("normalization", "weights"):
             if origin.get(name) and Path(origin[name]).is_file():
-                origin[name] = _copied(Path(origin[name]), folder, name)
+                origin[name] = copied(Path(origin[name]), folder, name)
+                files.append(origin[name])
+        self.model.save(folder / MODEL)
         stored = {
-            "format": _FORMAT,
+            "format": FORMAT,
             "environment": self.source.name,
             **origin,
+            "files": {name: digest((folder / name).read_bytes()) for name in files},
             "preset": self.preset,
             "configs": {name: asdict(config) for name, config in self.configs.items()},
         }
-        self.model.save(folder / _MODEL)
-        write_atomically(folder / _FILE, json.dumps(stored, indent=2) + "\n")
+        write_atomically(folder / FILE, json.dumps(stored, indent=2) + "\n")
         return folder
 
     @classmethod
@@ -196,13 +213,19 @@ class RobustController:
                 trusted and names what would be run.
             ValueError: if environment or policy were given as objects, which no folder holds, and
                 are not given again.
+            ValueError: for a file in it that is not the one that was saved with the settings, as
+                after a ``save`` that was broken off.
+
+        Warns:
+            UserWarning: if code that the folder names has changed since.
         """
         folder = Path(folder)
-        if not (folder / _FILE).exists():
-            raise FileNotFoundError(f"{folder} holds no controller: there is no {_FILE}")
-        stored, configs = _read(folder / _FILE)
+        if not (folder / FILE).exists():
+            raise FileNotFoundError(f"{folder} holds no controller: there is no {FILE}")
+        stored, configs = read_controller(folder / FILE)
         if not trusted:
-            _check_runs_nothing(folder, stored)
+            check_runs_nothing(folder, stored)
+        check_files(folder, stored.get("files") or {})
         for what, value in (("make_env", make_env), ("policy", policy)):
             if value is None and not stored["environment" if what == "make_env" else what]:
                 raise ValueError(f"{folder} names no {what}, which was an object: give it again")
@@ -212,18 +235,27 @@ class RobustController:
         names = {key: stored.get(key) for key in ("policy", "normalization", "weights")}
         origin: dict[str, Any] = {"search_path": list(dict.fromkeys(search_path))}
         if policy is None:
-            found = {key: _placed(value, folder) for key, value in names.items()}
+            found = {key: placed(value, folder) for key, value in names.items()}
             policy, given = found.pop("policy"), found
             origin["given"] = stored.get("given")
         else:
             given = {"normalization": None, "weights": None}
         assert policy is not None
         named = stored["environment"] if make_env is None else make_env
+        origin["code"] = code_of((named, policy), search_path)
+        before = stored.get("code") or {}
+        changed = [name for name, code in origin["code"].items() if before.get(name, code) != code]
+        if changed:
+            warnings.warn(
+                f"{', '.join(changed)} changed since the controller {folder} was made: robustify "
+                "the policy again if it acts otherwise",
+                stacklevel=2,
+            )
         source = source_for(named, policy, search_path)
         return cls(
             source,
             load_policy(policy, source.one(), **given, search_path=search_path),
-            EnsembleDynamics.load(folder / _MODEL),
+            EnsembleDynamics.load(folder / MODEL),
             configs,
             stored["preset"],
             {"policy": policy if isinstance(policy, str) else None, **given, **origin},
@@ -234,100 +266,11 @@ def source_for(
     make_env: MakeEnv, policy: Policy, search_path: Sequence[str] = ()
 ) -> EnvironmentSource:
     """The environment, with the parts of its observation in the order of a run's policy."""
-    run = Path(policy) if isinstance(policy, str) else None
-    config = None if run is None else RunDirectory(kept_by(run) or run).config_file
-    if config is None or not config.is_file():
-        return environment_source(make_env, search_path)
-    settings = read_config(config)
+    settings = settings_of_run(policy)
     if make_env != settings.get("task"):
         return environment_source(make_env, search_path)
     source = environment_source(make_env, settings.get("search_path") or ())
     return replace(source, observation_keys=tuple(settings.get("observation_keys") or ()))
-
-
-def _copied(file: Path, folder: Path, role: str) -> str:
-    """Put a copy of a file into a folder, unless it is that of the folder; its name there."""
-    # With its role, since files of different folders may have one name.
-    target = folder / (file.name if file.name.startswith(role) else f"{role}_{file.name}")
-    if file.resolve() != target.resolve():
-        write_atomically(target, file.read_bytes())
-    return target.name
-
-
-def _read(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
-    """What a controller's file holds, and its settings of L1."""
-    try:
-        stored = json.loads(read_text(file, _MOST_BYTES))
-        if stored["format"] == _FORMAT:
-            names = [stored[name] for name in ("environment", "policy", "preset")]
-            names += [stored.get(name) for name in ("normalization", "weights")]
-            names += stored.get("search_path") or ()
-            if not all(name is None or isinstance(name, str) for name in names):
-                raise TypeError("a name in it is no text")
-            configs = {name: L1Config(**values) for name, values in stored["configs"].items()}
-            _ = configs[stored["preset"]]
-            return stored, configs
-    except (
-        AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError
-    ) as error:  # fmt: skip
-        raise ValueError(f"{file} is damaged ({error!r}): robustify the policy again") from error
-    raise ValueError(
-        f"{file} has the format {stored['format']!r}, and this version reads {_FORMAT}: robustify "
-        "the policy again"
-    )
-
-
-def check_replaces(
-    folder: Path,
-    environment: str,
-    policy: str,
-    normalization: str | None = None,
-    weights: str | None = None,
-) -> None:
-    """Refuse a folder with the controller of another policy or environment.
-
-    Raises:
-        ValueError: naming what it holds.
-    """
-    try:
-        stored, _ = _read(folder / _FILE)
-    except (FileNotFoundError, ValueError):  # nothing that is of use
-        return
-    held = (stored["environment"], stored.get("given"))
-    if held[1] is not None and held != (environment, _given(policy, normalization, weights)):
-        raise ValueError(
-            f"{folder} holds the controller of {held[1]} in {held[0]}: give another --output, or "
-            "remove it"
-        )
-
-
-def _given(policy: str | None, *files: str | None) -> str | None:
-    """What names a policy, with the files that belong to it; ``None`` for an object."""
-    named = [policy, *files] if policy else []
-    return " with ".join(_whole(name) for name in named if name) or None
-
-
-def _whole(name: str) -> str:
-    """A name with the whole path of the file or folder in it."""
-    for part in (name, *name.split(":", 1)):
-        if part and Path(part).exists():
-            return name.replace(part, str(Path(part).resolve()))
-    return name
-
-
-def _check_runs_nothing(folder: Path, stored: dict[str, Any]) -> None:
-    for what, data in (("environment", ()), ("policy", ("torchscript", "onnx"))):
-        source = str(stored[what] or "")
-        if ":" in source and source.partition(":")[0] not in data:
-            raise ValueError(
-                f"{folder} names {source!r}, which would be run: say --trust if the folder is yours"
-            )
-
-
-def _placed(name: str | None, folder: Path) -> str | None:
-    """Where a file lies whose name a controller holds."""
-    kind, colon, file = (name or "").rpartition(":")
-    return f"{kind}{colon}{folder / file}" if name and (folder / file).is_file() else name
 
 
 def load_target(
@@ -345,26 +288,32 @@ def load_target(
         policy: the policy in that environment, which then has no L1.
         normalization: see :func:`load_policy`.
         weights: likewise.
-        trusted: see :meth:`RobustController.load`.
+        trusted: whether functions and pickles that a folder names may be run, those of a run in its
+            settings; what is named here is run in any case.
 
     Raises:
-        ValueError: if it is none of them, or a policy is given beside a folder.
+        ValueError: if it is none of them, a policy or a file of one is given beside a folder, or a
+            folder that is not to be trusted names what would be run.
     """
     folder = Path(target)
-    if folder.is_dir():
-        if policy is not None:
-            raise ValueError(f"{target} has a policy of its own: leave --policy out")
+    if folder.is_dir() or (kept_by(folder) and folder.is_file()):
+        given = {"policy": policy, "normalization": normalization, "weights": weights}
+        for name, value in given.items():
+            if value is not None:
+                raise ValueError(f"{target} has a policy of its own: leave --{name} out")
         for place in (folder, folder / "controller"):
-            if (place / _FILE).exists():
+            if (place / FILE).exists():
                 return RobustController.load(place, trusted=trusted)
-        return _of_run(folder)
-    if kept_by(folder) and folder.is_file():
+        if not trusted:
+            check_run_names_nothing(target)
         return _of_run(folder)
     if policy is None:
         raise ValueError(
             f"there is no folder {target}; give a controller, a run directory, or an environment "
             "with --policy"
         )
+    if not trusted:
+        check_run_names_nothing(policy)
     source = source_for(target, policy)
     acting = load_policy(policy, source.one(), normalization, weights)
     return RobustController(source, acting, EnsembleDynamics(1, 1, hidden=()), {}, OFF)
@@ -385,7 +334,9 @@ def _of_run(folder: Path) -> RobustController:
         configs[name] = config
     policy = list(run.algorithm.policies.values())[-1]
     model = run.algorithm.acting_dynamics
-    origin = {"policy": str(folder), "search_path": list(run.recipe.search_path)}
+    search_path = list(run.recipe.search_path)
+    code = code_of([run.recipe.task], search_path)
+    origin = {"policy": str(folder), "search_path": search_path, "code": code}
     source = environment_source(run.recipe.task, run.recipe.search_path)
     source = replace(source, observation_keys=tuple(run.recipe.observation_keys))
     preset = trained_with if trained_with in PRESETS else PRESETS[0]

@@ -12,6 +12,7 @@ from torchrl.data import ReplayBuffer
 from torchrl_l1.checks import check_choice, check_count, check_not_negative, check_positive
 from torchrl_l1.control import L1Config
 from torchrl_l1.control.layout import Layout
+from torchrl_l1.deployment.controller_folder import code_of
 from torchrl_l1.deployment.learning import (
     agreed_time_step,
     check_surroundings,
@@ -109,6 +110,8 @@ def robustify(
         check_positive("dt", dt)
     if epsilon is not None:
         check_not_negative("epsilon", epsilon)
+    search_path = folders_of([n for n in (make_env, policy) if isinstance(n, str)], [Path.cwd()])
+    code = code_of((make_env, policy), search_path)
     with private_randomness():  # environments may draw a seed as they are made
         source = source_for(make_env, policy)
         dt = agreed_time_step(source, dt)
@@ -135,10 +138,10 @@ def robustify(
         n = dynamics.observation_dim
         rate = target_switch_rate(n) if switch_rate is None else switch_rate
         epsilon, _ = epsilon_for(dynamics, found, rate)
-    named = [name for name in (make_env, policy) if isinstance(name, str)]
     origin = {
         "policy": policy if isinstance(policy, str) else None,
-        "search_path": folders_of(named, [Path.cwd()]),
+        "search_path": search_path,
+        "code": code,
         "normalization": normalization,
         "weights": weights,
     }

@@ -31,6 +31,7 @@ MODES = ("auto", "online", "offline", "disabled")
 
 # What W&B takes from the environment, older words among it.
 _WANDB_MODES = ("online", "offline", "disabled", "shared", "run", "dryrun")
+_ONLINE = ("online", "shared", "run")
 
 LOGGERS = ("wandb", "tensorboard")
 """What a recipe's ``loggers`` may name."""
@@ -53,9 +54,10 @@ def check_wandb_mode(mode: str) -> None:
         raise ValueError(
             f"WANDB_MODE={here}: it must be one of {', '.join(_WANDB_MODES)}; or set wandb.mode"
         )
-    if mode == "online" and not _has_key():
+    setting, asked = ("WANDB_MODE", here) if mode == "auto" else ("wandb.mode", mode)
+    if asked in _ONLINE and not _has_key():
         raise ValueError(
-            "wandb.mode=online needs an API key; log in with wandb login or set WANDB_API_KEY, or "
+            f"{setting}={asked} needs an API key; log in with wandb login or set WANDB_API_KEY, or "
             "choose wandb.mode=offline"
         )
 
@@ -98,7 +100,10 @@ def chosen_mode(mode: str) -> str:
 
 
 def _has_key() -> bool:
-    return bool(wandb.login(prompt=False, verify=False))
+    try:
+        return bool(wandb.login(prompt=False, verify=False))
+    except wandb.errors.Error as error:  # what is there is no key
+        raise ValueError(f"W&B: {message(error)}") from error
 
 
 def _logged_in() -> bool:
@@ -420,5 +425,5 @@ def log_evaluation(
             with trackers(now, run_dir, config, metrics, timings, say) as opened:
                 for tracker in opened:
                     tracker.evaluation(evaluated)
-    except (OSError, ValueError, RunDirectoryError) as error:
+    except (OSError, ValueError, RunDirectoryError, wandb.errors.Error) as error:
         say(f"{run_dir}: {evaluated.name} is not logged: {message(error)}")

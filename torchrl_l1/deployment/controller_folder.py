@@ -1,0 +1,192 @@
+"""The folder of a robust controller: what it holds, and what is named in it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torchrl_l1.atomic import write_atomically
+from torchrl_l1.control import L1Config
+from torchrl_l1.deployment.policies import Policy
+from torchrl_l1.envs import code_digests, file_digest
+from torchrl_l1.envs.references import require
+from torchrl_l1.experiment.checkpoints import kept_by
+from torchrl_l1.experiment.files import read_text
+from torchrl_l1.experiment.run_directory import RunDirectory, read_config
+from torchrl_l1.experiment.settings import NAMING_KEYS
+
+FILE, MODEL = "controller.json", "model.safetensors"
+"""Names of its files: settings, and the model."""
+
+FORMAT = 1
+"""Of the settings."""
+
+FILE_KINDS = ("sb3", "torchscript", "onnx")
+"""Kinds of policies that are files."""
+
+_MOST_BYTES = 1_000_000
+_WITH = " with "
+
+
+def copied(file: Path, folder: Path, role: str, kind: str = "") -> str:
+    """Put a copy of a file into a folder, unless it is that of the folder; its name there.
+
+    A model of the kind ``onnx`` has in it what it kept in other files.
+    """
+    # With its role, since files of different folders may have one name.
+    target = folder / (file.name if file.name.startswith(role) else f"{role}_{file.name}")
+    if file.resolve() != target.resolve():
+        content = file.read_bytes()
+        if kind == "onnx" and b"location" in content:  # by which it names other files
+            content = require("onnx", "onnx").load(str(file)).SerializeToString()
+        write_atomically(target, content)
+    return target.name
+
+
+def read_controller(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
+    """What a controller's file holds, and its settings of L1.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: if it is damaged, or of another version.
+    """
+    try:
+        stored = json.loads(read_text(file, _MOST_BYTES))
+        if stored["format"] == FORMAT:
+            names = [stored[name] for name in ("environment", "policy", "preset")]
+            names += [stored.get(name) for name in ("normalization", "weights")]
+            names += stored.get("search_path") or ()
+            for digests in (stored.get("files") or {}, stored.get("code") or {}):
+                names += [*digests.keys(), *digests.values()]
+            if not all(name is None or isinstance(name, str) for name in names):
+                raise TypeError("a name in it is no text")
+            configs = {name: L1Config(**values) for name, values in stored["configs"].items()}
+            _ = configs[stored["preset"]]
+            return stored, configs
+    except (
+        AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError
+    ) as error:  # fmt: skip
+        raise ValueError(f"{file} is damaged ({error!r}): robustify the policy again") from error
+    raise ValueError(
+        f"{file} has the format {stored['format']!r}, and this version reads {FORMAT}: robustify "
+        "the policy again"
+    )
+
+
+def check_files(folder: Path, digests: Mapping[str, str]) -> None:
+    """Refuse files that are not those which the settings were written with.
+
+    Raises:
+        ValueError: naming the first.
+    """
+    for name, known in digests.items():
+        file = folder / name
+        if file.is_file() and file_digest(file) != known:
+            raise ValueError(
+                f"{file} is not the one that {FILE} was written with: robustify the policy again"
+            )
+
+
+def code_of(names: Iterable[object], search_path: Sequence[str]) -> dict[str, str]:
+    """Digests of the files and modules that environment and policy are named by."""
+    texts = (name for name in names if isinstance(name, str))
+    return code_digests([n for n in texts if n.partition(":")[0] not in FILE_KINDS], search_path)
+
+
+def check_replaces(
+    folder: Path,
+    environment: str,
+    policy: str,
+    normalization: str | None = None,
+    weights: str | None = None,
+) -> None:
+    """Refuse a folder with the controller of another policy or environment.
+
+    Raises:
+        ValueError: naming what it holds.
+    """
+    try:
+        stored, _ = read_controller(folder / FILE)
+    except (FileNotFoundError, ValueError):  # nothing that is of use
+        return
+    held = (stored["environment"], stored.get("given"))
+    if held[1] is not None and held != (environment, given_by(policy, normalization, weights)):
+        raise ValueError(
+            f"{folder} holds the controller of {held[1]} in {held[0]}: give another --output, or "
+            "remove it"
+        )
+
+
+def check_spares(origin: Mapping[str, Any], file: Path) -> None:
+    """Refuse to replace a file that a policy comes from, or one in its run directory.
+
+    Raises:
+        ValueError: naming both.
+    """
+    names = [origin.get(name) for name in ("policy", "normalization", "weights")]
+    for name in filter(None, [*names, *str(origin.get("given") or "").split(_WITH)]):
+        kind, _, rest = name.partition(":")
+        source = Path(rest if kind in FILE_KINDS else name)
+        place = kept_by(source) or source
+        if file.exists() and file.resolve().is_relative_to(place.resolve()):
+            raise ValueError(
+                f"{file} is there, and the policy comes from {source}: name another file"
+            )
+
+
+def given_by(policy: str | None, *files: str | None) -> str | None:
+    """What names a policy, with the files that belong to it; ``None`` for an object."""
+    named = [policy, *files] if policy else []
+    return _WITH.join(_whole(name) for name in named if name) or None
+
+
+def _whole(name: str) -> str:
+    """A name with the whole path of the file or folder in it."""
+    for part in (name, *name.split(":", 1)):
+        if part and Path(part).exists():
+            return name.replace(part, str(Path(part).resolve()))
+    return name
+
+
+def check_runs_nothing(folder: Path, stored: dict[str, Any]) -> None:
+    """Refuse a controller whose environment or policy is code, or a pickle.
+
+    Raises:
+        ValueError: naming it.
+    """
+    _refuse_code(folder, [stored["environment"]])
+    _refuse_code(folder, [stored["policy"]], ("torchscript", "onnx"))
+    check_run_names_nothing(placed(stored["policy"], folder))
+
+
+def check_run_names_nothing(policy: Policy | None) -> None:
+    """Refuse a run whose settings name code; what is no run passes.
+
+    Raises:
+        ValueError: naming it.
+    """
+    settings = settings_of_run(policy)
+    _refuse_code(policy, [settings.get(key) for key in NAMING_KEYS])
+
+
+def _refuse_code(where: object, names: Iterable[object], data: Sequence[str] = ()) -> None:
+    for name in map(str, names):
+        if ":" in name and name.partition(":")[0] not in data:
+            raise ValueError(
+                f"{where} names {name!r}, which would be run: say --trust if the folder is yours"
+            )
+
+
+def settings_of_run(policy: Policy | None) -> dict[str, Any]:
+    """The settings of the run that a policy is from; none if it is from elsewhere."""
+    run = Path(policy) if isinstance(policy, str) else None
+    config = None if run is None else RunDirectory(kept_by(run) or run).config_file
+    return {} if config is None or not config.is_file() else read_config(config)
+
+
+def placed(name: str | None, folder: Path) -> str | None:
+    """Where a file lies whose name a controller holds."""
+    kind, colon, file = (name or "").rpartition(":")
+    return f"{kind}{colon}{folder / file}" if name and (folder / file).is_file() else name
