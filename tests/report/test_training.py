@@ -8,6 +8,7 @@ import pytest
 import scipy.stats
 from scipy.stats import trim_mean
 
+from torchrl_l1.report import report
 from torchrl_l1.report.identity import facts
 from torchrl_l1.report.runs import find_runs
 from torchrl_l1.report.study import Study, studies
@@ -43,6 +44,17 @@ def test_training_row_against_numpy(write_run: WriteRun, tmp_path: Path) -> None
     assert (row["return_low"], row["return_high"]) == pytest.approx((expected.low, expected.high))
     assert (row["seeds"], row["real_steps"], row["unfinished"]) == (4, 7 * 2500, "")
     assert (row["paper_mean"], row["paper_std"]) == ("-105.2", "81.6")
+
+
+def test_what_all_runs_do_unlike_their_recipe_is_told_and_bars_the_papers_numbers(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    for seed in range(2):
+        write_run([1], "l1=off", "horizon=50", seed=seed)
+    page = report([tmp_path / "runs"])
+    assert "paper_mean" not in (page.parent / "training.csv").read_text()
+    (line,) = [line for line in page.read_text().splitlines() if "`horizon=50`" in line]
+    assert line == "- inverted_pendulum: `outer_iterations=1`, `horizon=50`"
 
 
 def test_unfinished_runs_are_listed_and_not_counted(write_run: WriteRun, tmp_path: Path) -> None:

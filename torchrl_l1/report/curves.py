@@ -117,7 +117,8 @@ def plot_task(
     panels = []
     for noise, lines in main_lines(study, task):
         heading = named(name, title(task, noise))
-        authors = _authors(reference, task, noise)
+        usual = lines[0].runs[0].identity.usual_task
+        authors = _authors(reference, task, noise) if usual else []
         earlier = len(study.facts.named_stages[:-1])
         panels.append(Panel(heading, lines, authors, stage_bands(study, lines)[:earlier]))
     return plot_panels(panels, file)

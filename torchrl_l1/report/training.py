@@ -71,7 +71,7 @@ def _training(page: Page, study: Study, reference: ReferenceCurves | None) -> No
         + _l1_did(study),
     )
     page.text(training_table([row for cell, row in rows.items() if not cell.variant]))
-    page.text(_main_settings(study))
+    page.text(_main_settings(study), _recipe_departures(study))
     page.csv("training", list(rows.values()))
 
 
@@ -101,6 +101,21 @@ def _main_settings(study: Study) -> str:
     if not lines:
         return ""
     return "Runs with other settings than these have tables of their own:\n\n" + "\n".join(lines)
+
+
+def _recipe_departures(study: Study) -> str:
+    lines = []
+    for task in study.tasks():
+        # What main cells differ in is told above.
+        told = study.main_settings(task)
+        main = next(cell for cell in study.cells if cell.task == task and not cell.variant)
+        departures = study.cells[main][0].identity.recipe_departures
+        shown = [code(f"{key}={value}") for key, value in departures.items() if key not in told]
+        if shown:
+            lines.append(f"- {task}: {', '.join(shown)}")
+    if not lines:
+        return ""
+    return "In these settings all runs depart from their recipe:\n\n" + "\n".join(lines)
 
 
 def run_rows(study: Study) -> list[dict[str, Any]]:
@@ -154,7 +169,8 @@ def training_row(
     if published is not None:
         row |= published.columns()
     curves = None
-    if reference is not None and affine and cell.noise == "none" and cell.arm == BASELINE:
+    plain = cell.noise == "none" and cell.arm == BASELINE and what.usual_task
+    if reference is not None and affine and plain:
         curves = reference.model_form(cell.task, "affine")
     elif reference is not None and published is not None:
         curves = reference.training(*place)
@@ -317,7 +333,8 @@ def plot_comparison(
             if cell.noise == noise
         ]
         authors = []
-        if reference is not None and "model.form" in keys and noise == "none":
+        usual = any(run.identity.usual_task for line in lines for run in line.runs)
+        if reference is not None and "model.form" in keys and noise == "none" and usual:
             for form, style in (("nonlinear", "-"), ("affine", ":")):
                 curves = reference.model_form(task, form)
                 if curves is not None:
