@@ -132,7 +132,7 @@ def identify(config: Mapping[str, Any]) -> Identity:
     arm = closest_option(controller, task, by_filter=False)
     closest = closest_option(controller, task)
     compared = {
-        _clean(key): _text(value)
+        clean(key): _text(value)
         for key, value in settings.items()
         if key not in (*_NOT_COMPARED, *_NOISE_KEYS, *_FILTER_KEYS)
         and key.split(".")[0] not in _VOLATILE
@@ -195,14 +195,14 @@ def _noises() -> dict[str, dict[str, Any]]:
 def _text(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
-    return _clean(str(value))
+    return clean(str(value))
 
 
-def _clean(text: str) -> str:
+def clean(text: str) -> str:
     """Text that is text in Markdown, too: it goes into tables, headings and legends.
 
     Examples:
-        >>> _clean("a <b> | [c](d)")
+        >>> clean("a <b> | [c](d)")
         'a ?b? ? [c] (d)'
     """
     return re.sub(r"[^\w .,:;=+*/()\[\]{}'\"@%~^&#!?$-]", "?", text).replace("](", "] (")
