@@ -237,7 +237,7 @@ def test_unreadable_runs_are_listed_and_left_out(write_run: WriteRun, tmp_path: 
     file = lost / "metrics.csv"
     file.write_text(file.read_text().replace("-1.0", "nan"))
     text = report([tmp_path / "runs"]).read_text()
-    assert "1 runs, of which 1 are finished" in text
+    assert "2 runs, of which 1 are finished" in text
     assert "Left out, since they cannot be read:" in text
     assert f"- {file}, line 3: return_mean is 'nan', not a finite number" in text
 
@@ -328,7 +328,7 @@ def test_every_file_that_cannot_be_read_is_listed(write_run: WriteRun, tmp_path:
     (runs[4] / "checksums.json").write_text('{"metrics.csv": {"2": "0000"}}')
     (tmp_path / "runs" / "campaign.yaml").write_text("runs: 3\n")
     text = report([tmp_path / "runs"]).read_text()
-    assert "2 runs, of which 2 are finished" in text
+    assert "3 runs, of which 2 are finished" in text
     for run, words in zip(
         runs,
         (

@@ -21,7 +21,7 @@ def test_unfinished_runs_say_how_far_they_are(write_run: WriteRun, tmp_path: Pat
     write_run([], iterations=4)
     done, half, begun = find_runs([tmp_path])
     assert (done.finished, half.finished, begun.finished) == (True, False, False)
-    assert (half.progress, begun.progress) == ("2 of 4", "0 of 4")
+    assert (half.progress, begun.progress) == ("2 of 4 iterations", "0 of 4 iterations")
     assert done.final == 3.0
 
 
@@ -154,6 +154,7 @@ def test_what_cannot_be_read_is_left_out_and_the_rest_stays(
         good: {"ablation", "mine"},
         partly: {"ablation"},
     }
+    assert [(run.path, run.progress) for run in found.lost] == [(lost, "cannot be read")]
     assert len(found.errors) == 3
     for error, file in zip(
         found.errors,

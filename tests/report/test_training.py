@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import csv
+import io
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -80,7 +83,7 @@ def test_paired_differences_of_the_seeds_that_both_have(
             write_run(off[seed], "l1=off", seed=seed)
         if seed != 7:
             write_run(on[seed], "l1=paper", seed=seed, iterations=4 if seed == 0 else 3)
-    # Seed 0 of the L1 arm has other settings (4 iterations): no pair for it.
+    # Seed 0 of the L1 arm has other settings (4 iterations): no pair for it, nor for its baseline.
     stochastic = [
         row
         for row in paired_rows(study(tmp_path))
@@ -88,7 +91,7 @@ def test_paired_differences_of_the_seeds_that_both_have(
     ]
     (row,) = stochastic
     differences = on[1:6].mean(axis=1) - off[1:6].mean(axis=1)
-    assert (row["pairs"], row["seeds"], row["without_pair"]) == (5, "1 2 3 4 5", "6")
+    assert (row["pairs"], row["seeds"], row["without_pair"]) == (5, "1 2 3 4 5", "0 6 7")
     assert row["difference_mean"] == pytest.approx(differences.mean())
     assert row["iqm"] == pytest.approx(trim_mean(differences, 0.25))
     assert [float(v) for v in row["differences"].split()] == pytest.approx(
@@ -96,6 +99,28 @@ def test_paired_differences_of_the_seeds_that_both_have(
     )
     assert row["difference_low"] < row["difference_mean"] < row["difference_high"]
     assert differences.min() <= row["iqm_low"] <= row["iqm_high"] <= differences.max()
+
+
+def test_seeds_that_are_lost_leave_a_mark_in_the_tables(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    for seed in range(3):
+        for arm in ("off", "paper"):
+            run = write_run([-3, -2, -1], f"l1={arm}", seed=seed)
+            if arm == "paper" and seed:
+                metrics = run / "metrics.csv"
+                metrics.write_text(metrics.read_text().replace("-1.0", "nan"))
+    (run / "diverged.txt").write_text("training diverged in iteration 2")
+    page = report([tmp_path / "runs"])
+    rows, (pairs, _) = (
+        list(csv.DictReader(io.StringIO((page.parent / f"{table}.csv").read_text())))
+        for table in ("training", "pairs")
+    )
+    assert [(row["l1"], row["seeds"]) for row in rows] == [("off", "3"), ("paper", "1")]
+    assert rows[1]["unfinished"] == "seed 1: cannot be read; seed 2: diverged"
+    assert (pairs["seeds"], pairs["without_pair"]) == ("0", "1 2")
+    (line,) = re.findall(rf".*{run}/metrics.csv, line 4.*", page.read_text())
+    assert line.endswith("not a finite number. Its training diverged in iteration 2")
 
 
 def test_four_pairs_have_no_interquartile_mean(write_run: WriteRun, tmp_path: Path) -> None:

@@ -75,7 +75,7 @@ def report(
         raise ValueError(f"--output {output} is a file; give a folder")
     reference = None if reference_curves is None else ReferenceCurves(reference_curves)
     found = find_readable_runs(folders)
-    runs = found.runs
+    runs = [*found.runs, *found.lost]
     campaigns = find_campaigns(folders, runs, found.errors)
     every = studies(runs)
     output.mkdir(parents=True, exist_ok=True)

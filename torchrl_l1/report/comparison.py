@@ -180,13 +180,12 @@ def _differences(runs: Sequence[Run], against: Sequence[Run]) -> Mapping[str, An
         {run.identity.seed: run.final for run in cell if run.finished} for cell in (runs, against)
     )
     seeds = [seed for seed in ours if seed in theirs]
+    every = {run.identity.seed for run in (*runs, *against)}
     return {
         "pairs": len(seeds),
         "seeds": " ".join(map(str, seeds)),
         **difference_summary([ours[seed] - theirs[seed] for seed in seeds]),
-        "without_pair": " ".join(
-            str(run.identity.seed) for run in runs if run.identity.seed not in seeds
-        ),
+        "without_pair": " ".join(map(str, sorted(every - set(seeds)))),
     }
 
 

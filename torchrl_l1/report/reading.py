@@ -28,13 +28,16 @@ SWITCH_RATE = "l1/switch_rate"
 SIGNALS = (SWITCH_RATE, "l1/u_a", "l1/saturation")
 """Columns of a metrics table that only runs with L1 have."""
 
+AGAIN = "Move the run directory away, or run it again"
+"""What to do about a run whose files are damaged."""
+
 # No table of a run comes near; more would be read into memory whole.
 _MOST_BYTES = 200_000_000
 
 _METRICS = ("iteration", "real_steps", "return_mean", "return_deterministic")
 
 
-def read_metrics(file: Path, stages: int = 0) -> dict[str, np.ndarray]:
+def read_metrics(file: Path, stages: int = 0, remedy: str = AGAIN) -> dict[str, np.ndarray]:
     """Columns of a metrics table; empty ones for a run that has only just begun.
 
     Those of :data:`SIGNALS` are NaN where the run has none.
@@ -42,9 +45,10 @@ def read_metrics(file: Path, stages: int = 0) -> dict[str, np.ndarray]:
     Args:
         file: the table.
         stages: of the algorithm; with any, there is a column ``stage``.
+        remedy: what an error says to do about it.
     """
     numbers = (*_METRICS, "stage") if stages else _METRICS
-    rows = checked_rows(file, numbers, optional=SIGNALS) if file.exists() else []
+    rows = checked_rows(file, numbers, optional=SIGNALS, remedy=remedy) if file.exists() else []
     columns = {name: np.array([row[name] for row in rows]) for name in (*numbers, *SIGNALS)}
     if not np.array_equal(columns["iteration"], np.arange(len(rows))):
         raise RunDirectoryError(f"{file}: the iterations are not 0, 1, 2, ... without a gap")
@@ -240,16 +244,17 @@ def checked_rows(
     optional: Sequence[str] = (),
     optional_words: Sequence[str] = (),
     if_any: Sequence[str] = (),
+    remedy: str = AGAIN,
 ) -> list[dict[str, Any]]:
     """As :func:`numeric_rows`, of a file of a run directory.
 
     Raises:
-        RunDirectoryError: in its place, with what to do about it.
+        RunDirectoryError: in its place, with what to do about it, the ``remedy``.
     """
     try:
         return numeric_rows(file, numbers, words, optional, optional_words, if_any)
     except ValueError as error:
-        raise RunDirectoryError(f"{error}. Move the run directory away, or run it again") from error
+        raise RunDirectoryError(f"{error}. {remedy}") from error
 
 
 def read_versions(file: Path) -> dict[str, str]:

@@ -21,6 +21,7 @@ from torchrl_l1.experiment.files import read_text
 from torchrl_l1.experiment.run_directory import RunDirectory, run_directories
 from torchrl_l1.report.identity import Identity, facts, identify
 from torchrl_l1.report.reading import (
+    AGAIN,
     SIGNALS,
     Evaluation,
     distinct_policies,
@@ -59,6 +60,7 @@ class Run:
         stage: number ``(T,)`` of the stage that each outer iteration belongs to, from 1; ``None``
             where the algorithm has one only.
         diverged: what is no longer finite in its training; empty if all is well.
+        lost: whether its metrics cannot be used; it has no iteration then.
     """
 
     path: Path
@@ -72,6 +74,7 @@ class Run:
     evaluations: dict[str, list[Evaluation]] = field(default_factory=dict)
     stage: np.ndarray | None = None
     diverged: str = ""
+    lost: bool = False
 
     @property
     def finished(self) -> bool:
@@ -80,8 +83,10 @@ class Run:
 
     @property
     def progress(self) -> str:
-        """How far it is, such as ``7 of 33``."""
-        return f"{len(self.returns)} of {self.identity.outer_iterations}"
+        """How far it is, such as ``7 of 33 iterations``, or what has become of it."""
+        if self.lost:
+            return "diverged" if self.diverged else "cannot be read"
+        return f"{len(self.returns)} of {self.identity.outer_iterations} iterations"
 
     @property
     def ending(self) -> np.ndarray:
@@ -155,9 +160,11 @@ class Findings:
         runs: those that can be read, in alphabetical order of their paths.
         errors: what is wrong with the files that cannot be read; each names its file. Of a run
             with such an evaluation, ``timing.csv`` or ``versions.json`` the rest is in ``runs``.
+        lost: those of which no more can be read than what they are of.
     """
 
     runs: list[Run] = field(default_factory=list)
+    lost: list[Run] = field(default_factory=list)
     errors: list[RunDirectoryError] = field(default_factory=list)
 
 
@@ -193,7 +200,8 @@ def find_readable_runs(folders: Sequence[Path]) -> Findings:
             try:
                 if isinstance(config, RunDirectoryError):
                     raise config
-                found.runs.append(_read(RunDirectory(path), config, found.errors))
+                run = _read(RunDirectory(path), config, found.errors)
+                (found.lost if run.lost else found.runs).append(run)
             except RunDirectoryError as error:
                 found.errors.append(error)
     if not found.runs:
@@ -245,6 +253,23 @@ def _diverged(file: Path) -> str:
         raise RunDirectoryError(f"cannot read {file}: {error}") from error
 
 
+def _read_columns(
+    directory: RunDirectory, identity: Identity, stages: int, diverged: str
+) -> dict[str, np.ndarray]:
+    if problem := directory.metrics_problem():
+        raise RunDirectoryError(problem)
+    # Run again, it would diverge again: what is told is when and in what, and no remedy.
+    remedy = f"Its {diverged}" if diverged else AGAIN
+    columns = read_metrics(directory.metrics_file, stages, remedy)
+    iterations = len(columns["iteration"])
+    if iterations > identity.outer_iterations:
+        raise RunDirectoryError(
+            f"{directory.metrics_file} has {iterations} iterations, but "
+            f"{directory.config_file} says {identity.outer_iterations}"
+        )
+    return columns
+
+
 def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirectoryError]) -> Run:
     try:
         identity = identify(config)
@@ -252,20 +277,6 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
     # A damaged configuration may hold anything anywhere.
     except Exception as error:
         raise RunDirectoryError(f"cannot use {directory.config_file}: {message(error)}") from error
-    if problem := directory.metrics_problem():
-        raise RunDirectoryError(problem)
-    try:
-        columns = read_metrics(directory.metrics_file, len(algorithm.named_stages))
-    except RunDirectoryError as error:
-        # Returns of no number enter no mean: it is left out, but the reason is told.
-        why = _diverged(directory.diverged_file)
-        raise RunDirectoryError(f"{error} ({why})" if why else str(error)) from error
-    iterations = len(columns["iteration"])
-    if iterations > identity.outer_iterations:
-        raise RunDirectoryError(
-            f"{directory.metrics_file} has {iterations} iterations, but "
-            f"{directory.config_file} says {identity.outer_iterations}"
-        )
 
     def readable(read: Callable[[], T], otherwise: T) -> T:
         try:
@@ -274,7 +285,13 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
             errors.append(error)
             return otherwise
 
-    path = directory.path
+    path, stages = directory.path, len(algorithm.named_stages)
+    diverged = readable(partial(_diverged, directory.diverged_file), "")
+    versions = readable(partial(read_versions, path / "versions.json"), {})
+    # As of a run that has only just begun.
+    lost = read_metrics(path / "no metrics", stages)
+    columns = readable(partial(_read_columns, directory, identity, stages, diverged), lost)
+    iterations = len(columns["iteration"])
     tables = sorted((path / "evaluations").glob("*.csv"))
     whole = iterations if iterations == identity.outer_iterations else None
     evaluations: dict[str, list[Evaluation]] = {
@@ -291,8 +308,9 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
             partial(read_seconds, directory.timing_file, iterations, tuple(algorithm.phases)),
             {phase: np.full(iterations, np.nan) for phase in algorithm.phases},
         ),
-        readable(partial(read_versions, path / "versions.json"), {}),
+        versions,
         {k: distinct_policies(tests, algorithm) for k, tests in evaluations.items() if tests},
         columns.get("stage"),
-        readable(partial(_diverged, directory.diverged_file), ""),
+        diverged,
+        columns is lost,
     )

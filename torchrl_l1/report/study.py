@@ -166,15 +166,20 @@ def _with_changed_files(runs: Sequence[Run]) -> list[Run]:
 
 
 def with_baselines(study: Study, runs: Sequence[Run]) -> tuple[list[tuple[Run, Run]], list[str]]:
-    """Each finished run with its finished baseline, and the seeds of the others."""
-    pairs, single = [], []
+    """Each finished run of a cell with its finished baseline, and the seeds of either without."""
+    pairs = []
     for run in runs:
         baseline = study.baseline_of(run)
         if run.finished and baseline is not None and baseline.finished:
             pairs.append((run, baseline))
-        else:
-            single.append(str(run.identity.seed))
-    return pairs, single
+    seeds = {
+        run.identity.seed
+        for run in study.runs
+        if run.identity.arm == BASELINE and _place_key(run) == _place_key(runs[0])
+    }
+    seeds |= {run.identity.seed for run in runs}
+    single = sorted(seeds - {run.identity.seed for run, _ in pairs})
+    return pairs, [str(seed) for seed in single]
 
 
 def place_columns(cell: Cell) -> dict[str, Any]:
@@ -230,9 +235,13 @@ def _merged_evaluations(best: Run, others: Sequence[Run]) -> dict[str, list[Eval
     return merged
 
 
-def _pairing_key(run: Run) -> tuple[object, ...]:
+def _place_key(run: Run) -> tuple[object, ...]:
     what = run.identity
-    return what.task, what.noise, what.seed, _frozen(what.shared)
+    return what.task, what.noise, _frozen(what.shared)
+
+
+def _pairing_key(run: Run) -> tuple[object, ...]:
+    return *_place_key(run), run.identity.seed
 
 
 def _frozen(settings: Mapping[str, str]) -> frozenset[tuple[str, str]]:

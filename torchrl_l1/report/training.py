@@ -158,7 +158,7 @@ def training_row(
         row["real_steps"] = round(float(np.mean([run.real_steps[-1] for run in done])))
         row |= l1_means(done, [run.ending for run in done])
     row["unfinished"] = "; ".join(
-        f"seed {run.identity.seed}: {run.progress} iterations" for run in runs if not run.finished
+        f"seed {run.identity.seed}: {run.progress}" for run in runs if not run.finished
     )
     what = runs[0].identity
     affine = what.model_form == "affine"
