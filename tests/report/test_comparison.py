@@ -237,10 +237,17 @@ def test_comparison_says_which_settings_differ(write_run: WriteRun, tmp_path: Pa
     for arm in ("off", "paper"):
         write_run([1], f"l1={arm}", "cem.candidates=50", recipe=PETS_PENDULUM)
         write_run([1], f"l1={arm}", "cem.candidates=60", "l1.epsilon=3", recipe=DETS_PENDULUM)
+    write_run([1], "l1=robust", "cem.candidates=50", "l1.epsilon=2", recipe=PETS_PENDULUM)
+    write_run([1], "l1=robust", "cem.candidates=60", "l1.epsilon=0.5", recipe=DETS_PENDULUM)
     assert differing_settings(studies(find_runs([tmp_path])), "inverted_pendulum") == {
         "cem.candidates": {"PETS": "50", "DETS": "60"},
         "model.head": {"PETS": "gaussian", "DETS": "deterministic"},
-        "l1.epsilon": {"L1-PETS": "1.0", "L1-DETS": "3.0"},
+        "l1.epsilon": {
+            "L1-PETS": "1.0",
+            "L1-DETS": "3.0",
+            "L1-PETS (robust)": "2.0",
+            "L1-DETS (robust)": "0.5",
+        },
     }
     text = report([tmp_path / "runs"]).read_text()
     assert "`cem.candidates` 50 (PETS), 60 (DETS);" in text

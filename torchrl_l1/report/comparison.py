@@ -154,12 +154,12 @@ def differing_settings(studies: Sequence[Study], task: str) -> dict[str, dict[st
                 found.setdefault(("", key), {})[study.facts.name] = value
             for key, value in what.l1.items():
                 found.setdefault((cell.arm, key), {})[label] = value
-    # What the algorithm is called is no setting.
-    return {
-        key: values
-        for (_, key), values in found.items()
-        if key not in ("algorithm", "recipe") and len(set(values.values())) > 1
-    }
+    differing: dict[str, dict[str, str]] = {}
+    for (_, key), values in found.items():
+        # What the algorithm is called is no setting.
+        if key not in ("algorithm", "recipe") and len(set(values.values())) > 1:
+            differing.setdefault(key, {}).update(values)
+    return differing
 
 
 def _places(studies: Sequence[Study]) -> list[tuple[str, str]]:
