@@ -20,6 +20,7 @@ from torchrl_l1.report.evaluations import (
     evaluation_table,
 )
 from torchrl_l1.report.reading import Evaluation, one_policy
+from torchrl_l1.report.recovery import robustness_table
 from torchrl_l1.report.runs import find_runs
 from torchrl_l1.report.study import Study, studies
 from torchrl_l1.report.training import training_row
@@ -69,9 +70,15 @@ def test_a_table_says_over_how_many_seeds_each_controller_was_tested(
         write_run([1.0], "l1=off", seed=seed, evaluations={"mine": mine, "ablation": mine})
     rows = evaluation_rows(study(tmp_path), "mine")
     assert [row["training_seeds"] for row in rows] == [3, 2]
-    for text in (evaluation_table(rows), ablation_table(ablation_rows(rows))):
+    names = ("L1 off", "L1 paper")
+    for text, (first, second) in (
+        (evaluation_table(rows), names),
+        (robustness_table(rows), names),
+        (ablation_table(ablation_rows(rows)), ("neither", "testing only")),
+    ):
         cells = [line.strip("| ").split(" | ") for line in text.splitlines()]
-        assert dict(zip(cells[0], cells[2], strict=True))["training seeds"] == "3, 2"
+        seeds = dict(zip(cells[0], cells[2], strict=True))["training seeds"]
+        assert seeds == f"3 ({first}), 2 ({second})"
 
 
 def test_evaluations_over_training_seeds(write_run: WriteRun, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from torchrl_l1.report.page import (
     interval_text,
     markdown,
     spread_text,
+    values_text,
 )
 from torchrl_l1.report.runs import Run
 from torchrl_l1.report.statistics import difference_summary
@@ -65,7 +66,7 @@ def _settings(studies: Sequence[Study], tasks: Sequence[str]) -> str:
     lines = []
     for task in tasks:
         differing = [
-            f"`{key}` {_values(values)}"
+            f"`{key}` {values_text(values)}"
             for key, values in differing_settings(studies, task).items()
         ]
         if differing:
@@ -73,14 +74,6 @@ def _settings(studies: Sequence[Study], tasks: Sequence[str]) -> str:
     if not lines:
         return ""
     return "Settings that several have and that differ:\n\n" + "\n".join(lines)
-
-
-def _values(by_algorithm: Mapping[str, str]) -> str:
-    """Such as ``19 (METRPO), 15 (PETS, DETS)``."""
-    names: dict[str, list[str]] = {}
-    for name, value in by_algorithm.items():
-        names.setdefault(value, []).append(name)
-    return ", ".join(f"{value} ({', '.join(found)})" for value, found in names.items())
 
 
 def compared_places(studies: Sequence[Study]) -> dict[str, list[str]]:
