@@ -77,7 +77,20 @@ def evaluation_sections(page: Page, study: Study) -> None:
             if robust and name in special and name != "ablation":
                 recovery_section(page, study.facts, name, rows)
             _tuning(page, study.facts, name, rows)
+            page.text(_drawn_apart(rows))
             page.csv(name, rows)
+
+
+def _drawn_apart(rows: Sequence[Row]) -> str:
+    """Where the settings of an evaluation have changed before it was through with all runs."""
+    columns = ("episodes_per_seed", "evaluation_seeds")
+    mixed = [row for row in rows if any(" " in row[column] for column in columns)]
+    if not mixed:
+        return ""
+    return (
+        f"In {len(mixed)} of {len(rows)} rows of the CSV policies were tested over other episodes "
+        "than each other: `episodes_per_seed` has their numbers, `evaluation_seeds` their seeds."
+    )
 
 
 def _sim_to_real(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> None:
@@ -322,6 +335,9 @@ def _summary(tests: Sequence[tuple[Run, Evaluation]]) -> dict[str, Any]:
     result: dict[str, Any] = {
         "training_seeds": len(values),
         "episodes_per_seed": " ".join(sorted({str(test.episodes) for _, test in tests})),
+        "evaluation_seeds": " ".join(
+            sorted({str(test.seed) for _, test in tests if test.seed is not None})
+        ),
         "return_mean": mean.pop("return_mean"),
         "std": float(np.std(values)),
         "return_values": " ".join(f"{value:.6g}" for value in values),
