@@ -18,6 +18,7 @@ from torchrl_l1.campaign.description import load_yaml
 from torchrl_l1.experiment.errors import RunDirectoryError, message
 from torchrl_l1.experiment.evaluate import table_checksums
 from torchrl_l1.experiment.files import read_text
+from torchrl_l1.experiment.matrix import disturbance_words
 from torchrl_l1.experiment.run_directory import RunDirectory, run_directories
 from torchrl_l1.report.identity import Identity, facts, identify
 from torchrl_l1.report.reading import (
@@ -214,7 +215,9 @@ def find_readable_runs(folders: Sequence[Path]) -> Findings:
     return found
 
 
-def _read_table(file: Path, iterations: int | None) -> list[Evaluation]:
+def _read_table(
+    file: Path, iterations: int | None, errors: list[RunDirectoryError]
+) -> list[Evaluation]:
     """An evaluation whose name is a word, as campaigns ask for: it goes into names and headings.
 
     One that was made before a run has gone on is of another policy than the run's last.
@@ -223,6 +226,7 @@ def _read_table(file: Path, iterations: int | None) -> list[Evaluation]:
         file: the table.
         iterations: of the run; of one that is not finished ``None`` will do: its tables enter
             nothing.
+        errors: returns that are not finite join these; the other rows are as good as ever.
     """
     if not re.fullmatch(r"[A-Za-z0-9_.+-]{1,100}", file.stem):
         raise RunDirectoryError(f"cannot use {file}: its name is no word of at most 100 letters")
@@ -243,7 +247,17 @@ def _read_table(file: Path, iterations: int | None) -> list[Evaluation]:
             f"{file} was made after {made_after} iterations, and the run has {iterations}; its "
             "campaign makes it again"
         )
-    return [replace(test, seed=seed) for test in read_evaluations(file)]
+    tests = read_evaluations(file)
+    for test in tests:
+        if not math.isfinite(test.return_mean):
+            condition = f"L1 {test.controller}, noise {test.noise}, {test.policy} policy"
+            errors.append(
+                RunDirectoryError(
+                    f"{file}: the return is {test.return_mean} with {condition}, "
+                    f"{disturbance_words(test.columns())}"
+                )
+            )
+    return [replace(test, seed=seed) for test in tests if math.isfinite(test.return_mean)]
 
 
 def _diverged(file: Path) -> str:
@@ -295,7 +309,7 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
     tables = sorted((path / "evaluations").glob("*.csv"))
     whole = iterations if iterations == identity.outer_iterations else None
     evaluations: dict[str, list[Evaluation]] = {
-        file.stem: readable(partial(_read_table, file, whole), []) for file in tables
+        file.stem: readable(partial(_read_table, file, whole, errors), []) for file in tables
     }
     return Run(
         path,
