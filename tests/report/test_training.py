@@ -11,13 +11,15 @@ import pytest
 import scipy.stats
 from scipy.stats import trim_mean
 
-from torchrl_l1.report import report
+from torchrl_l1.report import report, training
+from torchrl_l1.report.curves import Panel
 from torchrl_l1.report.identity import facts
 from torchrl_l1.report.runs import find_runs
 from torchrl_l1.report.study import Study, studies
 from torchrl_l1.report.training import (
     paired_rows,
     paired_table,
+    plot_comparison,
     run_rows,
     time_rows,
     time_table,
@@ -121,6 +123,17 @@ def test_seeds_that_are_lost_leave_a_mark_in_the_tables(
     assert (pairs["seeds"], pairs["without_pair"]) == ("0", "1 2")
     (line,) = re.findall(rf".*{run}/metrics.csv, line 4.*", page.read_text())
     assert line.endswith("not a finite number. Its training diverged in iteration 2")
+
+
+def test_more_cells_than_colours_are_told_apart(
+    write_run: WriteRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for epsilon in range(9):
+        write_run([1], "l1=paper", f"l1.epsilon={epsilon}")
+    panels: list[Panel] = []
+    monkeypatch.setattr(training, "plot_panels", lambda found, file: panels.extend(found))
+    plot_comparison(study(tmp_path), "inverted_pendulum", ["l1.epsilon"], tmp_path / "a.png")
+    assert len({(line.color, str(line.style)) for line in panels[0].lines}) == 9
 
 
 def test_four_pairs_have_no_interquartile_mean(write_run: WriteRun, tmp_path: Path) -> None:

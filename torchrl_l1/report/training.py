@@ -34,7 +34,7 @@ from torchrl_l1.report.statistics import (
     published_spread,
 )
 from torchrl_l1.report.study import Cell, Study, place_columns, with_baselines
-from torchrl_l1.report.style import arm_label, color, named, title
+from torchrl_l1.report.style import arm_label, looks, named, title
 
 # More settings are told in the text and in the table, not in headings and legends.
 _MOST_KEYS, _LONGEST_LABEL = 6, 100
@@ -324,11 +324,11 @@ def plot_comparison(
     cells = [cell for cell in study.compared(keys) if cell.task == task]
     rows = {cell: row for row, cell in enumerate(study.compared(keys), start=1)}
     names = {cell: _name(study, cell, keys, rows[cell]) for cell in cells}
-    order = list(dict.fromkeys(names.values()))
+    drawn_as = looks(dict.fromkeys(names.values()))
     panels = []
     for noise in dict.fromkeys(cell.noise for cell in cells):
         lines = [
-            cell_line(study, cell, names[cell], color(order.index(names[cell])))
+            cell_line(study, cell, names[cell], drawn_as[names[cell]])
             for cell in cells
             if cell.noise == noise
         ]
