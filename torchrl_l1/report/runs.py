@@ -301,7 +301,7 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
 
     path, stages = directory.path, len(algorithm.named_stages)
     diverged = readable(partial(_diverged, directory.diverged_file), "")
-    versions = readable(partial(read_versions, path / "versions.json"), {})
+    versions: dict[str, str] = readable(partial(read_versions, path / "versions.json"), {})
     # As of a run that has only just begun.
     lost = read_metrics(path / "no metrics", stages)
     columns = readable(partial(_read_columns, directory, identity, stages, diverged), lost)
