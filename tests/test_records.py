@@ -121,6 +121,36 @@ def test_runs_of_another_campaign_are_refused(
         records.pack(NAME, [other])
 
 
+def test_places_do_not_depend_on_what_folders_are_called(
+    records: ModuleType, tmp_path: Path
+) -> None:
+    place = Path("mbmf/swimmer/l1=off/seed_0")
+    outer = tmp_path / "mbmf" / "runs" / "campaigns" / "mbmf" / place
+    assert records.behind("mbmf", outer, "mbmf/swimmer") == place
+    other = tmp_path / "first" / place
+    with pytest.raises(SystemExit, match="lies in no folder mbmf/mbmf/swimmer"):
+        records.behind("mbmf", other, "mbmf/swimmer")
+    other.mkdir(parents=True)
+    (tmp_path / "first/campaign.yaml").write_text("name: mbmf\n")
+    assert records.behind("mbmf", other, "mbmf/swimmer") == place
+
+
+def test_the_first_folders_description_counts_and_damaged_tables_stop_nothing(
+    records: ModuleType, unpack: Callable[[], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = unpack()
+    description = (folder / "campaign.yaml").read_text() + "# changed\n"
+    (folder / "campaign.yaml").write_text(description)
+    run = next(run for run in find_runs([folder]) if run.evaluations)
+    (damaged,) = (run.path / "evaluations").glob("*.csv")
+    damaged.write_text("l1\n")
+    records.pack(NAME, [folder])
+    assert f"left out: {damaged}" in capsys.readouterr().err
+    packed = unpack()
+    assert (packed / "campaign.yaml").read_text() == description
+    assert not damaged.exists() and (run.path / "metrics.csv").exists()
+
+
 @pytest.mark.parametrize("words", [["pack"], ["pack", NAME], ["no_such_campaign"]])
 def test_wrong_words_are_refused(
     records: ModuleType, words: list[str], monkeypatch: pytest.MonkeyPatch

@@ -26,12 +26,14 @@ from contextlib import chdir
 from pathlib import Path
 
 from torchrl_l1.atomic import write_atomically
+from torchrl_l1.campaign.description import load_yaml
 from torchrl_l1.cli import main as command
 from torchrl_l1.experiment.run_directory import run_directories
-from torchrl_l1.report.runs import find_runs
+from torchrl_l1.report.runs import Run, find_readable_runs
 
 HERE = Path(__file__).parent
 RECORDS = "records.tar.xz"
+DESCRIPTION = "campaign.yaml"
 CURVES = "l1_metrpo_curves.csv"
 TEXTS = ("config.yaml", "versions.json", "metrics.csv", "timing.csv", "diverged.txt")
 USAGE = "usage: records.py [NAME ...] | records.py pack NAME FOLDER ..."
@@ -48,10 +50,12 @@ def unpack(name: str, folder: Path) -> None:
         archive.extractall(folder, filter="data")
 
 
-def texts(run: Path) -> Iterator[Path]:
-    """The files of a run that its record holds."""
-    yield from (run / name for name in TEXTS if (run / name).exists())
-    yield from (file for file in (run / "evaluations").rglob("*") if file.is_file())
+def texts(run: Run) -> Iterator[Path]:
+    """The files of a run that its record holds: no evaluations that cannot be read."""
+    yield from (run.path / name for name in TEXTS if (run.path / name).exists())
+    for file in (run.path / "evaluations").rglob("*"):
+        if file.is_file() and file.stem in run.evaluations:
+            yield file
 
 
 def pack(name: str, folders: Sequence[Path]) -> int:
@@ -60,7 +64,8 @@ def pack(name: str, folders: Sequence[Path]) -> int:
     Args:
         name: the campaign.
         folders: where the runs are; a run's place in the campaign is its path behind the
-            folder that has the campaign's name.
+            folder with the description of the campaign, or with its name. What cannot be read
+            there is told, and the rest is packed.
 
     Returns:
         how many runs there are records of.
@@ -70,16 +75,19 @@ def pack(name: str, folders: Sequence[Path]) -> int:
         campaign.mkdir()
         if (HERE / name / RECORDS).exists():
             unpack(name, campaign)
+        described = [folder for folder in folders if (folder / DESCRIPTION).exists()]
+        for folder in described[:1]:
+            shutil.copyfile(folder / DESCRIPTION, campaign / DESCRIPTION)
         for folder in folders:
-            description = folder / "campaign.yaml"
-            if description.exists() and not (campaign / description.name).exists():
-                shutil.copyfile(description, campaign / description.name)
-            for run in find_runs([folder]):
+            found = find_readable_runs([folder])
+            for error in found.errors:
+                print(f"records.py: left out: {error}", file=sys.stderr)
+            for run in found.runs:
                 if not run.finished:
                     continue
-                target = campaign / behind(name, run.path)
+                target = campaign / behind(name, run.path, run.identity.shared["recipe"])
                 shutil.rmtree(target, ignore_errors=True)
-                for file in texts(run.path):
+                for file in texts(run):
                     copy = target / file.relative_to(run.path)
                     copy.parent.mkdir(parents=True, exist_ok=True)
                     shutil.copyfile(file, copy)
@@ -88,17 +96,26 @@ def pack(name: str, folders: Sequence[Path]) -> int:
         return len(list(run_directories(campaign)))
 
 
-def behind(name: str, path: Path) -> Path:
-    """The place of a run in its campaign.
+def behind(name: str, path: Path, recipe: str) -> Path:
+    """The place of a run in its campaign, which begins with the name of its recipe.
 
     Examples:
-        >>> behind("mbmf", Path("runs/mbmf/mbmf/swimmer/l1=off/seed_0"))
-        PosixPath('mbmf/swimmer/l1=off/seed_0')
+        >>> behind("mbmf", Path("/home/mbmf/runs/mbmf/mbmf/swimmer/seed_0"), "mbmf/swimmer")
+        PosixPath('mbmf/swimmer/seed_0')
     """
-    parts = path.resolve().parts
-    if name not in parts:
-        sys.exit(f"records.py: {path} lies in no folder {name}, as the runs of that campaign do")
-    return Path(*parts[parts.index(name) + 1 :])
+    path = path.resolve()
+    for folder in path.parents:
+        description = folder / DESCRIPTION
+        if description.is_file() and load_yaml(description).get("name") == name:
+            return path.relative_to(folder)
+    begin = (name, *Path(recipe).parts)
+    for at in reversed(range(len(path.parts))):
+        if path.parts[at : at + len(begin)] == begin:
+            return Path(*path.parts[at + 1 :])
+    sys.exit(
+        f"records.py: {path} lies in no folder {Path(*begin)}, as the runs of that campaign do, "
+        f"nor below its {DESCRIPTION}"
+    )
 
 
 def packed(folder: Path) -> bytes:

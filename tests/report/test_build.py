@@ -13,9 +13,13 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from torchrl_l1.campaign.description import dump_yaml, read_campaign
+from torchrl_l1.campaign import Campaign, RunMatrix, read_campaign
+from torchrl_l1.campaign.description import dump_yaml
+from torchrl_l1.campaign.plan import plan
 from torchrl_l1.cli import main
 from torchrl_l1.report import report
+from torchrl_l1.report.build import find_campaigns
+from torchrl_l1.report.runs import find_runs
 
 WriteRun = Callable[..., Path]
 
@@ -52,8 +56,10 @@ def campaign(write_run: WriteRun, tmp_path: Path) -> Path:
     for seed in range(3):
         for arm in ("off", "paper"):
             returns = -np.geomspace(80, 0.01 * (1 + seed), 5)
-            write_run(returns, f"l1={arm}", seed=seed, evaluations=evaluations(seed))
-        write_run([-70, -60, -50, -40, -30], "l1=off", "model=affine", seed=seed)
+            name = f"metrpo/inverted_pendulum/model=nonlinear/l1={arm}/seed_{seed}"
+            write_run(returns, f"l1={arm}", seed=seed, name=name, evaluations=evaluations(seed))
+        name = f"metrpo/inverted_pendulum/model=affine/l1=off/seed_{seed}"
+        write_run([-70, -60, -50, -40, -30], "l1=off", "model=affine", seed=seed, name=name)
     write_run([-70, -60], "l1=paper", seed=3, iterations=5)
     folder = tmp_path / "runs"
     (folder / "campaign.yaml").write_text(dump_yaml(read_campaign("figure2").to_dict()))
@@ -101,7 +107,7 @@ def test_report_joins_tables_and_figures(campaign: Path, tmp_path: Path) -> None
         assert f"\n## {heading}\n" in text
     assert "10 runs, of which 9 are finished" in text
     assert "seed 3: 2 of 5 iterations" in text
-    assert "9 of 21 runs finished, 1 unfinished, 11 not begun" in text
+    assert "9 of 21 runs finished, 12 not begun, 1 here that it does not ask for" in text
     assert f"$ torchrl-l1 campaign figure2 --output {campaign}\n" in text
     assert f"--reference-curves {curves}\n" in text
     assert "| torch | 2.13.0 | 10 |" in text
@@ -168,8 +174,8 @@ def test_campaign_with_overrides_is_repeated_from_its_file(campaign: Path) -> No
 
 def test_a_campaign_within_another_counts_its_own_runs(write_run: WriteRun, tmp_path: Path) -> None:
     """The outer one without a matrix, as a file by hand may be: one run."""
-    for name, seed in (("seed_0", 0), ("inner/seed_1", 1), ("inner/seed_2", 2)):
-        write_run([-9, -8, -7], seed=seed, name=name)
+    for name, seed in (("", 0), ("inner/", 1), ("inner/", 2)):
+        write_run([-9, -8, -7], seed=seed, name=f"{name}metrpo/hopper/seed_{seed}")
     inner = "name: inner\nruns: [{recipe: metrpo/hopper, matrix: {seed: [1, 2, 3]}}]\n"
     (tmp_path / "runs" / "inner" / "campaign.yaml").write_text(inner)
     outer = "name: outer\nruns: [{recipe: metrpo/hopper}]\n"
@@ -178,6 +184,22 @@ def test_a_campaign_within_another_counts_its_own_runs(write_run: WriteRun, tmp_
     assert "**outer** (1 of 1 runs finished)" in text
     assert "**inner** (2 of 3 runs finished, 1 not begun)" in text
     assert "cannot be read" not in text
+
+
+def test_only_runs_that_a_campaign_asks_for_count_as_its_own(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    """A matrix may have other seeds and keys than when its first runs were made."""
+    folder = tmp_path / "runs"
+    matrix = RunMatrix("metrpo/hopper", matrix={"noise": ["none", "action"], "seed": [1, 2]})
+    made = [run.directory.path for run in plan(Campaign("own", folder, "", [matrix], []), folder)]
+    for path in (*made[:3], "metrpo/hopper/noise=none/seed_0", "metrpo/hopper/seed_1"):
+        write_run([-9], name=str(path), iterations=2 if path == made[0] else 1)
+    content = {"name": "own", "runs": [{"recipe": "metrpo/hopper", "matrix": matrix.matrix}]}
+    (folder / "campaign.yaml").write_text(dump_yaml(content))
+    (state,) = find_campaigns([folder], find_runs([folder]), [])
+    assert (state.expected, state.finished, state.begun) == (4, 2, 1)
+    assert state.others == 2
 
 
 def test_comparisons_say_the_settings_of_each_cell(write_run: WriteRun, tmp_path: Path) -> None:
@@ -215,7 +237,7 @@ def test_unreadable_runs_are_listed_and_left_out(write_run: WriteRun, tmp_path: 
     file = lost / "metrics.csv"
     file.write_text(file.read_text().replace("-1.0", "nan"))
     text = report([tmp_path / "runs"]).read_text()
-    assert "1 runs, of which 1 are finished" in text
+    assert "2 runs, of which 1 are finished" in text
     assert "Left out, since they cannot be read:" in text
     assert f"- {file}, line 3: return_mean is 'nan', not a finite number" in text
 
@@ -306,7 +328,7 @@ def test_every_file_that_cannot_be_read_is_listed(write_run: WriteRun, tmp_path:
     (runs[4] / "checksums.json").write_text('{"metrics.csv": {"2": "0000"}}')
     (tmp_path / "runs" / "campaign.yaml").write_text("runs: 3\n")
     text = report([tmp_path / "runs"]).read_text()
-    assert "2 runs, of which 2 are finished" in text
+    assert "3 runs, of which 2 are finished" in text
     for run, words in zip(
         runs,
         (
@@ -331,7 +353,7 @@ def test_text_from_files_is_text(write_run: WriteRun, tmp_path: Path) -> None:
     config.recipe = "=cmd()" + evil
     OmegaConf.save(config, run / "config.yaml")
     (run / "versions.json").write_text(json.dumps({evil: f"=1+1{evil}"}))
-    content = {"name": evil, "description": evil, "runs": [{"matrix": {"seed": [0]}}]}
+    content = {"name": evil, "description": evil, "runs": [{"recipe": evil}]}
     (tmp_path / "runs" / "campaign.yaml").write_text(dump_yaml(content))
     page = report([tmp_path / "runs"])
     outside = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)

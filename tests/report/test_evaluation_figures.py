@@ -73,6 +73,29 @@ def test_each_return_stands_above_what_l1_adds_to_it(drawn: list[Figure], tmp_pa
     assert (bias.get_yscale(), difference.get_yscale()) == ("symlog", "linear")
 
 
+def test_no_two_controllers_look_the_same(drawn: list[Figure], tmp_path: Path) -> None:
+    tuned = [f"paper epsilon={value}" for value in range(9)]
+    rows = [
+        row(l1, bias=bias, return_mean=place - bias)
+        for bias in (0.0, 1.0)
+        for place, l1 in enumerate(("off", "paper", *tuned, "oracle"))
+    ]
+    plot_disturbances(rows, "Task", tmp_path / "a.png", METRPO)
+    lines = drawn[0].axes[0].lines
+    assert len({(line.get_color(), line.get_marker()) for line in lines}) == 12
+    colors = [line.get_color() for line in lines]
+    assert colors[0] not in colors[1:] and colors[-1] not in colors[:-1]
+
+    swept = [
+        row("paper", option="paper", epsilon=epsilon, alpha=alpha / 20, return_mean=1.0)
+        for epsilon in (0.1, 1.0)
+        for alpha in range(1, 9)
+    ]
+    plot_tuning(swept, "Task", tmp_path / "b.png")
+    (axis,) = drawn[1].axes
+    assert len({(line.get_color(), line.get_marker()) for line in axis.lines}) == 8
+
+
 def test_limits_beyond_what_a_return_can_be_change_no_scale(
     drawn: list[Figure], tmp_path: Path
 ) -> None:

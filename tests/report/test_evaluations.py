@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.matrix import Axis, Condition, axes
+from torchrl_l1.report import report
 from torchrl_l1.report.evaluation_summary import summarize, summary_tables
 from torchrl_l1.report.evaluations import (
     ablation_rows,
@@ -20,6 +22,7 @@ from torchrl_l1.report.evaluations import (
     evaluation_table,
 )
 from torchrl_l1.report.reading import Evaluation, one_policy
+from torchrl_l1.report.recovery import robustness_table
 from torchrl_l1.report.runs import find_runs
 from torchrl_l1.report.study import Study, studies
 from torchrl_l1.report.training import training_row
@@ -69,9 +72,15 @@ def test_a_table_says_over_how_many_seeds_each_controller_was_tested(
         write_run([1.0], "l1=off", seed=seed, evaluations={"mine": mine, "ablation": mine})
     rows = evaluation_rows(study(tmp_path), "mine")
     assert [row["training_seeds"] for row in rows] == [3, 2]
-    for text in (evaluation_table(rows), ablation_table(ablation_rows(rows))):
+    names = ("L1 off", "L1 paper")
+    for text, (first, second) in (
+        (evaluation_table(rows), names),
+        (robustness_table(rows), names),
+        (ablation_table(ablation_rows(rows)), ("neither", "testing only")),
+    ):
         cells = [line.strip("| ").split(" | ") for line in text.splitlines()]
-        assert dict(zip(cells[0], cells[2], strict=True))["training seeds"] == "3, 2"
+        seeds = dict(zip(cells[0], cells[2], strict=True))["training seeds"]
+        assert seeds == f"3 ({first}), 2 ({second})"
 
 
 def test_evaluations_over_training_seeds(write_run: WriteRun, tmp_path: Path) -> None:
@@ -102,6 +111,26 @@ def test_evaluations_over_training_seeds(write_run: WriteRun, tmp_path: Path) ->
     text = evaluation_table(rows[:2])
     assert "| 30.2 ± 45.1 †1 |" in text
     assert "- †1: impossible" in text
+
+
+@pytest.mark.parametrize(("episodes", "drawn"), [(25, 0), (100, 0), (25, 1)])
+def test_a_page_tells_where_policies_of_a_row_had_other_episodes(
+    episodes: int, drawn: int, write_run: WriteRun, tmp_path: Path
+) -> None:
+    for seed, (number, start) in enumerate(((25, 0), (episodes, drawn))):
+        tests = [
+            test | {"episodes": number}
+            for test in evaluated(0.0, ("off", "none", "stochastic", 0.0))
+        ]
+        run = write_run([1.0], "l1=off", seed=seed, evaluations={"mine": tests})
+        (run / "evaluations/mine.yaml").write_text(f"{{iterations: 1, seed: {start}}}")
+    page = report([tmp_path / "runs"])
+    told = "In 1 of 1 rows of the CSV policies were tested over other episodes" in page.read_text()
+    assert told == ((episodes, drawn) != (25, 0))
+    with (page.parent / "mine.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert set(row["episodes_per_seed"].split()) == {"25", str(episodes)}
+    assert set(row["evaluation_seeds"].split()) == {"0", str(drawn)}
 
 
 def test_ablation_takes_the_noise_of_the_training_and_one_l1(

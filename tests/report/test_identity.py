@@ -107,3 +107,27 @@ def test_runs_with_code_of_other_folders_are_no_seeds_of_each_other(
         write_run([1], f"search_path=[{place}]", seed=seed)
     (study,) = studies(find_runs([tmp_path]))
     assert sorted(len(runs) for runs in study.cells.values()) == [1, 2]
+
+
+@pytest.mark.parametrize(
+    "departure",
+    [
+        "perturbation.actuator_bias=0.9",
+        "perturbation.actuator_delay=2",
+        "horizon=50",
+        "reward=own.py:reward",
+        "termination=none",
+    ],
+)
+def test_only_runs_of_the_papers_task_stand_beside_its_numbers(
+    departure: str, write_run: WriteRun, tmp_path: Path
+) -> None:
+    noise = ("noise=action", "perturbation.observation_noise=0.3")
+    usual = [write_run([1], "l1=off"), write_run([1], "l1=paper", *noise)]
+    other = write_run([1], "l1=off", departure)
+    found = {run.path: run.identity for run in find_runs([tmp_path])}
+    assert [found[path].as_published for path in (*usual, other)] == [True, True, False]
+    key, _, value = departure.partition("=")
+    departures = found[other].recipe_departures
+    assert departures.pop(key) in (value, f"{value}.0")
+    assert found[usual[1]].recipe_departures == departures

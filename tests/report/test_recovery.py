@@ -98,13 +98,14 @@ def test_report_says_what_is_recovered(write_run: WriteRun, tmp_path: Path) -> N
     lines = [line for line in section.splitlines() if line.startswith("|")]
     columns = [cell.strip() for cell in lines[0].strip("|").split("|")]
     assert columns == [
-        *("disturbance", "L1 off", "L1 paper", "oracle", "oracle less off", "L1 paper recovered"),
+        *("disturbance", "training seeds", "L1 off", "L1 paper", "oracle", "oracle less off"),
+        "L1 paper recovered",
     ]
     undisturbed, half, whole = ([c.strip() for c in one.strip("|").split("|")] for one in lines[2:])
     assert (undisturbed[0], undisturbed[-1]) == ("undisturbed", "–")
     assert (half[0], half[-1], whole[-1]) == ("bias 0.5", "0.75 [0.75, 0.75]", "0.75 [0.75, 0.75]")
     # Episodes that end early say so.
-    assert whole[1].endswith(", 50 steps") and whole[2].endswith(", 90 steps")
+    assert whole[2].endswith(", 50 steps") and whole[3].endswith(", 90 steps")
     assert "one training seed" not in section
     pictures = {file.name for file in page.parent.glob("*.png")}
     assert {
@@ -192,5 +193,15 @@ def test_many_disturbances_share_a_column(monkeypatch: pytest.MonkeyPatch) -> No
 def test_lines_go_by_disturbance_and_controllers_end_with_the_oracle() -> None:
     rows = [row(l1, 1.0, gain=gain) for gain in (0.5, 1.0) for l1 in ("oracle", "off", "paper")]
     table = robustness_table(rows).splitlines()
-    assert table[0].startswith("| disturbance | L1 off | L1 paper | oracle |")
+    assert table[0].startswith("| disturbance | training seeds | L1 off | L1 paper | oracle |")
     assert [line.split("|")[1].strip() for line in table[2:]] == ["undisturbed", "gain 0.5"]
+
+
+def test_what_the_oracle_gains_is_of_as_many_policies_as_there_are() -> None:
+    def gap(value: float, policies: int) -> dict[str, Any]:
+        limits = {"gap_low": value - 1, "gap_high": value + 1}
+        return {"gap": value, **limits, "recovered_policies": policies}
+
+    rows = [row("off", 1.0), row("paper", 2.0, **gap(7, 2)), row("robust", 3.0, **gap(5, 3))]
+    header, _, line = (text.strip("| ") for text in robustness_table(rows).splitlines())
+    assert header.endswith("oracle less off") and line.endswith("| 5 [4, 6]")

@@ -21,7 +21,7 @@ def test_unfinished_runs_say_how_far_they_are(write_run: WriteRun, tmp_path: Pat
     write_run([], iterations=4)
     done, half, begun = find_runs([tmp_path])
     assert (done.finished, half.finished, begun.finished) == (True, False, False)
-    assert (half.progress, begun.progress) == ("2 of 4", "0 of 4")
+    assert (half.progress, begun.progress) == ("2 of 4 iterations", "0 of 4 iterations")
     assert done.final == 3.0
 
 
@@ -120,6 +120,35 @@ def test_what_a_table_repeats_counts_once(write_run: WriteRun, tmp_path: Path) -
     assert "episodes/mine.csv, line 4: what it says of L1 paper" in str(error)
 
 
+def test_a_return_of_no_number_costs_its_own_row_of_an_evaluation(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    row = {"noise": "none", "gain": 1, "policy": "stochastic"}
+    returns = {("off", 0.0): -1.0, ("off", 0.5): -2.0, ("paper", 0.5): float("nan")}
+    conditions = {(l1, bias): row | {"l1": l1, "bias": bias} for l1, bias in returns}
+    tests = [conditions[at] | {"return_mean": r, "episodes": 2} for at, r in returns.items()]
+    episodes = [
+        conditions[at] | {"episode": i, "return": value + i - 0.5}
+        for at, value in returns.items()
+        for i in range(2)
+    ]
+    run = write_run([-9], evaluations={"mine": tests, "episodes/mine": episodes, "other": tests})
+    spoil(run / "evaluations/other.csv", "nan", "oops")
+    found = find_readable_runs([tmp_path])
+    kept = {(t.l1, t.disturbances["bias"]): t for t in found.runs[0].evaluations.pop("mine")}
+    assert {at: test.return_mean for at, test in kept.items()} == {
+        at: value for at, value in returns.items() if at[0] == "off"
+    }
+    assert kept["off", 0.5].returns == (-2.5, -1.5)
+    assert not found.runs[0].evaluations
+    assert list(map(str, found.errors)) == [
+        f"{run}/evaluations/mine.csv: the return is nan with L1 paper, noise none, stochastic "
+        "policy, bias 0.5",
+        f"{run}/evaluations/other.csv, line 4: return_mean is 'oops', not a number. Delete it and "
+        "start its campaign again",
+    ]
+
+
 def test_an_evaluation_of_before_the_run_has_gone_on_is_left_out(
     write_run: WriteRun, tmp_path: Path
 ) -> None:
@@ -154,6 +183,7 @@ def test_what_cannot_be_read_is_left_out_and_the_rest_stays(
         good: {"ablation", "mine"},
         partly: {"ablation"},
     }
+    assert [(run.path, run.progress) for run in found.lost] == [(lost, "cannot be read")]
     assert len(found.errors) == 3
     for error, file in zip(
         found.errors,

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import random
 from collections.abc import Callable
 from pathlib import Path
@@ -249,3 +250,17 @@ def test_noise_of_other_strengths_comes_last_by_kind_and_strength() -> None:
     assert sorted(shuffled, key=noise_order) == order
     assert noise_words("action 0.3, observation 1") == "action noise 0.3 and observation noise 1"
     assert title("half_cheetah", "observation 0.2") == "Half cheetah, observation noise 0.2"
+
+
+def test_runs_with_files_of_the_users_that_changed_are_no_seeds_of_each_other(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    for seed, (reward, data) in enumerate(("ac", "ac", "bc", "bc")):
+        run = write_run([1], "l1=off", "reward=own.py:reward", seed=seed)
+        digests = {"own.py": f"sha256 {reward}", "data.npz": f"sha256 {data}", "torch": str(seed)}
+        (run / "versions.json").write_text(json.dumps(digests))
+    (study,) = studies(find_runs([tmp_path]))
+    seeds = {
+        cell.variant: [run.identity.seed for run in runs] for cell, runs in study.cells.items()
+    }
+    assert seeds == {(): [0, 1], (("own.py", "sha256 b"),): [2, 3]}

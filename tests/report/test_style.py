@@ -5,7 +5,7 @@ from pathlib import Path
 import matplotlib
 from matplotlib.text import Text
 
-from torchrl_l1.report.style import grid, legend_below, save
+from torchrl_l1.report.style import color, grid, legend_below, looks, save
 
 
 def test_names_between_dollars_are_no_formulas_and_other_figures_have_theirs(
@@ -25,3 +25,14 @@ def test_names_between_dollars_are_no_formulas_and_other_figures_have_theirs(
     assert sum("$" in text.get_text() for text in texts) >= 4
     assert not any(text.get_parse_math() for text in texts)
     assert matplotlib.rcParams["text.parse_math"]
+
+
+def test_arms_have_their_colours_to_themselves_and_no_two_lines_look_the_same() -> None:
+    names = ["oracle", *(f"line {number}" for number in range(20)), "off"]
+    drawn_as = looks(names)
+    assert drawn_as.keys() == set(names)
+    assert [drawn_as[arm].color for arm in ("oracle", "off")] == [color(0, "oracle"), color(0)]
+    others = [drawn_as[name] for name in names[1:-1]]
+    assert not {look.color for look in others} & {color(0, "oracle"), color(0)}
+    for differing in ("style", "marker"):
+        assert len({(look.color, str(getattr(look, differing))) for look in others}) == 20

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import csv
+import io
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,12 +11,15 @@ import pytest
 import scipy.stats
 from scipy.stats import trim_mean
 
+from torchrl_l1.report import report, training
+from torchrl_l1.report.curves import Panel
 from torchrl_l1.report.identity import facts
 from torchrl_l1.report.runs import find_runs
 from torchrl_l1.report.study import Study, studies
 from torchrl_l1.report.training import (
     paired_rows,
     paired_table,
+    plot_comparison,
     run_rows,
     time_rows,
     time_table,
@@ -45,6 +51,17 @@ def test_training_row_against_numpy(write_run: WriteRun, tmp_path: Path) -> None
     assert (row["paper_mean"], row["paper_std"]) == ("-105.2", "81.6")
 
 
+def test_what_all_runs_do_unlike_their_recipe_is_told_and_bars_the_papers_numbers(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    for seed in range(2):
+        write_run([1], "l1=off", "horizon=50", seed=seed)
+    page = report([tmp_path / "runs"])
+    assert "paper_mean" not in (page.parent / "training.csv").read_text()
+    (line,) = [line for line in page.read_text().splitlines() if "`horizon=50`" in line]
+    assert line == "- inverted_pendulum: `outer_iterations=1`, `horizon=50`"
+
+
 def test_unfinished_runs_are_listed_and_not_counted(write_run: WriteRun, tmp_path: Path) -> None:
     write_run([0, 0, 6], "l1=off", seed=0)
     write_run([1e6, 1e6], "l1=off", seed=1, iterations=3)
@@ -68,7 +85,7 @@ def test_paired_differences_of_the_seeds_that_both_have(
             write_run(off[seed], "l1=off", seed=seed)
         if seed != 7:
             write_run(on[seed], "l1=paper", seed=seed, iterations=4 if seed == 0 else 3)
-    # Seed 0 of the L1 arm has other settings (4 iterations): no pair for it.
+    # Seed 0 of the L1 arm has other settings (4 iterations): no pair for it, nor for its baseline.
     stochastic = [
         row
         for row in paired_rows(study(tmp_path))
@@ -76,7 +93,7 @@ def test_paired_differences_of_the_seeds_that_both_have(
     ]
     (row,) = stochastic
     differences = on[1:6].mean(axis=1) - off[1:6].mean(axis=1)
-    assert (row["pairs"], row["seeds"], row["without_pair"]) == (5, "1 2 3 4 5", "6")
+    assert (row["pairs"], row["seeds"], row["without_pair"]) == (5, "1 2 3 4 5", "0 6 7")
     assert row["difference_mean"] == pytest.approx(differences.mean())
     assert row["iqm"] == pytest.approx(trim_mean(differences, 0.25))
     assert [float(v) for v in row["differences"].split()] == pytest.approx(
@@ -84,6 +101,39 @@ def test_paired_differences_of_the_seeds_that_both_have(
     )
     assert row["difference_low"] < row["difference_mean"] < row["difference_high"]
     assert differences.min() <= row["iqm_low"] <= row["iqm_high"] <= differences.max()
+
+
+def test_seeds_that_are_lost_leave_a_mark_in_the_tables(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    for seed in range(3):
+        for arm in ("off", "paper"):
+            run = write_run([-3, -2, -1], f"l1={arm}", seed=seed)
+            if arm == "paper" and seed:
+                metrics = run / "metrics.csv"
+                metrics.write_text(metrics.read_text().replace("-1.0", "nan"))
+    (run / "diverged.txt").write_text("training diverged in iteration 2")
+    page = report([tmp_path / "runs"])
+    rows, (pairs, _) = (
+        list(csv.DictReader(io.StringIO((page.parent / f"{table}.csv").read_text())))
+        for table in ("training", "pairs")
+    )
+    assert [(row["l1"], row["seeds"]) for row in rows] == [("off", "3"), ("paper", "1")]
+    assert rows[1]["unfinished"] == "seed 1: cannot be read; seed 2: diverged"
+    assert (pairs["seeds"], pairs["without_pair"]) == ("0", "1 2")
+    (line,) = re.findall(rf".*{run}/metrics.csv, line 4.*", page.read_text())
+    assert line.endswith("not a finite number. Its training diverged in iteration 2")
+
+
+def test_more_cells_than_colours_are_told_apart(
+    write_run: WriteRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for epsilon in range(9):
+        write_run([1], "l1=paper", f"l1.epsilon={epsilon}")
+    panels: list[Panel] = []
+    monkeypatch.setattr(training, "plot_panels", lambda found, file: panels.extend(found))
+    plot_comparison(study(tmp_path), "inverted_pendulum", ["l1.epsilon"], tmp_path / "a.png")
+    assert len({(line.color, str(line.style)) for line in panels[0].lines}) == 9
 
 
 def test_four_pairs_have_no_interquartile_mean(write_run: WriteRun, tmp_path: Path) -> None:

@@ -200,6 +200,20 @@ def cells(matrix: RunMatrix) -> Iterator[dict[str, str]]:
         yield dict(zip(keys, map(value_text, values), strict=True))
 
 
+def levels(matrix: RunMatrix) -> list[list[str]]:
+    """Names of folders, level by level: below the campaign's a run's path is one of each.
+
+    Examples:
+        >>> levels(RunMatrix("pets/swimmer", matrix={"l1": ["off", "paper"]}))
+        [['pets'], ['swimmer'], ['l1=off', 'l1=paper'], ['seed_0']]
+    """
+    chosen = dict(matrix.matrix)
+    seeds = [f"seed_{seed}" for seed in chosen.pop("seed")]
+    recipe = [[part] for part in Path(recipe_name(matrix.recipe)).parts]
+    places = [[path_text(f"{k}={value_text(v)}") for v in values] for k, values in chosen.items()]
+    return [*recipe, *places, seeds]
+
+
 def _runs(index: int, matrix: RunMatrix, output: Path, trusted: bool) -> Iterator[PlannedRun]:
     recipe = matrix.recipe
     for cell in cells(matrix):

@@ -24,7 +24,7 @@ from torchrl_l1.experiment.l1_options import OFF, UNTUNED
 from torchrl_l1.experiment.matrix import disturbance_words, disturbed
 from torchrl_l1.report.page import markdown
 from torchrl_l1.report.recovery import controllers, recovered_text, recovery_columns
-from torchrl_l1.report.style import arm_label, color, fit_scale, grid, legend_below, save
+from torchrl_l1.report.style import arm_label, fit_scale, grid, legend_below, looks, save
 
 Disturbances: TypeAlias = str | Mapping[str, float | Sequence[float]]
 """Name of a suite, or values of disturbances by name."""
@@ -240,16 +240,15 @@ class Assessment(Sequence[Row]):
         }
 
     def _draw_line(self, axis: Any, name: str, rows: Sequence[Row], what: str, words: str) -> None:
-        for index, l1 in enumerate(self.controllers):
+        for l1, look in looks(self.controllers).items():
             mine = sorted((row for row in rows if row["l1"] == l1), key=lambda row: row[name])
             x = [row[name] for row in mine]
-            shade = color(3 + index, l1)
             axis.plot(
-                x, [row[f"{what}_median"] for row in mine], "o--" if l1 == ORACLE else "o-",
-                color=shade, markersize=4, label=arm_label(l1),
+                x, [row[f"{what}_median"] for row in mine], "--" if l1 == ORACLE else "-",
+                color=look.color, marker=look.marker, markersize=4, label=arm_label(l1),
             )  # fmt: skip
             low, high = ([row[f"{what}_{side}"] for row in mine] for side in ("lowest", "highest"))
-            axis.fill_between(x, low, high, color=shade, alpha=0.15, linewidth=0)
+            axis.fill_between(x, low, high, color=look.color, alpha=0.15, linewidth=0)
         entry = DISTURBANCES[name]
         axis.set_xlabel(f"{entry.words} ({entry.units})")
         axis.set_ylabel(words)
@@ -258,12 +257,14 @@ class Assessment(Sequence[Row]):
     def _draw_bars(self, axis: Any, what: str, words: str) -> None:
         lines = self._lines()
         thick = 0.8 / len(self.controllers)
+        drawn_as = looks(self.controllers)
         for index, l1 in enumerate(self.controllers):
             places = [place for place, found in enumerate(lines.values()) if l1 in found]
             mine = [found[l1] for found in lines.values() if l1 in found]
             middle = [row[f"{what}_median"] for row in mine]
             y = [place + (index - (len(self.controllers) - 1) / 2) * thick for place in places]
-            axis.barh(y, middle, thick, color=color(3 + index, l1), alpha=0.8, label=arm_label(l1))
+            shade = drawn_as[l1].color
+            axis.barh(y, middle, thick, color=shade, alpha=0.8, label=arm_label(l1))
             ranges = [(row[f"{what}_lowest"], row[f"{what}_highest"]) for row in mine]
             axis.hlines(y, *zip(*ranges, strict=True), color="black", linewidth=0.8)
         axis.set_yticks(range(len(lines)), list(lines), fontsize=8)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import gc
 import math
+import operator
 import os
 import shlex
 from collections.abc import Sequence
@@ -12,8 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchrl_l1.campaign import read_campaign
+from torchrl_l1.campaign import CampaignError, RunMatrix, read_campaign
 from torchrl_l1.campaign.description import load_yaml
+from torchrl_l1.campaign.plan import levels
 from torchrl_l1.experiment.errors import RunDirectoryError, message
 from torchrl_l1.experiment.files import refuse_link, write_atomically
 from torchrl_l1.experiment.recipes import available_campaigns
@@ -73,7 +75,7 @@ def report(
         raise ValueError(f"--output {output} is a file; give a folder")
     reference = None if reference_curves is None else ReferenceCurves(reference_curves)
     found = find_readable_runs(folders)
-    runs = found.runs
+    runs = [*found.runs, *found.lost]
     campaigns = find_campaigns(folders, runs, found.errors)
     every = studies(runs)
     output.mkdir(parents=True, exist_ok=True)
@@ -157,6 +159,7 @@ class CampaignState:
         expected: number of runs that it asks for.
         finished: number of finished ones.
         begun: number of those that are not finished.
+        others: number of runs in its folder that it does not ask for.
     """
 
     name: str
@@ -165,6 +168,7 @@ class CampaignState:
     expected: int
     finished: int
     begun: int
+    others: int
 
 
 def find_campaigns(
@@ -195,24 +199,38 @@ def _read_campaign(folder: Path, runs: Sequence[Run]) -> CampaignState:
     content = load_yaml(file)
     try:
         name = str(content.get("name", folder.name))
-        # Without a matrix it is one run, of seed 0.
-        matrices = [entry.get("matrix") or {} for entry in content["runs"]]
-        expected = sum(math.prod(map(len, matrix.values())) for matrix in matrices)
-    except (AttributeError, IndexError, KeyError, TypeError) as error:
+        asked = [
+            levels(RunMatrix(entry["recipe"], matrix=entry.get("matrix") or {}))
+            for entry in content["runs"]
+        ]
+    except (AttributeError, IndexError, KeyError, TypeError, CampaignError) as error:
         raise ValueError(f"{file} is no campaign file: {error!r}") from error
     given: str | Path = file
     if name in available_campaigns():
         # The file in the folder has the overrides of its command; the shipped one has none.
         same = read_campaign(name).to_dict()["runs"] == content["runs"]
         given = name if same else file
-    mine = [run for run in runs if _campaign_of(run.path.resolve()) == folder.resolve()]
+    below = [run for run in runs if _campaign_of(run.path.resolve()) == folder.resolve()]
+    mine = [
+        run
+        for run in below
+        if _is_one_of(run.path.resolve().relative_to(folder.resolve()).parts, asked)
+    ]
     return CampaignState(
         name,
         str(content.get("description", "")),
         shlex.join(["torchrl-l1", "campaign", str(given), "--output", str(folder)]),
-        expected,
+        sum(math.prod(map(len, names)) for names in asked),
         sum(run.finished for run in mine),
         sum(not run.finished for run in mine),
+        len(below) - len(mine),
+    )
+
+
+def _is_one_of(place: Sequence[str], asked: Sequence[Sequence[Sequence[str]]]) -> bool:
+    """Whether a path is in a matrix of these; all paths of one may be more than memory holds."""
+    return any(
+        len(place) == len(names) and all(map(operator.contains, names, place)) for names in asked
     )
 
 
@@ -232,6 +250,7 @@ def _campaigns(page: Page, campaigns: Sequence[CampaignState]) -> None:
         state = f"{campaign.finished} of {campaign.expected} runs finished"
         state += f", {campaign.begun} unfinished" * (campaign.begun > 0)
         state += f", {left} not begun" * (left > 0)
+        state += f", {campaign.others} here that it does not ask for" * (campaign.others > 0)
         page.text(
             f"Campaign **{plain(campaign.name)}** ({state}). {plain(campaign.description)}".strip(),
             f"```console\n$ {_one_line(campaign.command)}\n```",

@@ -15,6 +15,7 @@ from torchrl_l1.report.page import (
     interval_text,
     markdown,
     spread_text,
+    values_text,
 )
 from torchrl_l1.report.runs import Run
 from torchrl_l1.report.statistics import difference_summary
@@ -65,7 +66,7 @@ def _settings(studies: Sequence[Study], tasks: Sequence[str]) -> str:
     lines = []
     for task in tasks:
         differing = [
-            f"`{key}` {_values(values)}"
+            f"`{key}` {values_text(values)}"
             for key, values in differing_settings(studies, task).items()
         ]
         if differing:
@@ -73,14 +74,6 @@ def _settings(studies: Sequence[Study], tasks: Sequence[str]) -> str:
     if not lines:
         return ""
     return "Settings that several have and that differ:\n\n" + "\n".join(lines)
-
-
-def _values(by_algorithm: Mapping[str, str]) -> str:
-    """Such as ``19 (METRPO), 15 (PETS, DETS)``."""
-    names: dict[str, list[str]] = {}
-    for name, value in by_algorithm.items():
-        names.setdefault(value, []).append(name)
-    return ", ".join(f"{value} ({', '.join(found)})" for value, found in names.items())
 
 
 def compared_places(studies: Sequence[Study]) -> dict[str, list[str]]:
@@ -154,12 +147,12 @@ def differing_settings(studies: Sequence[Study], task: str) -> dict[str, dict[st
                 found.setdefault(("", key), {})[study.facts.name] = value
             for key, value in what.l1.items():
                 found.setdefault((cell.arm, key), {})[label] = value
-    # What the algorithm is called is no setting.
-    return {
-        key: values
-        for (_, key), values in found.items()
-        if key not in ("algorithm", "recipe") and len(set(values.values())) > 1
-    }
+    differing: dict[str, dict[str, str]] = {}
+    for (_, key), values in found.items():
+        # What the algorithm is called is no setting.
+        if key not in ("algorithm", "recipe") and len(set(values.values())) > 1:
+            differing.setdefault(key, {}).update(values)
+    return differing
 
 
 def _places(studies: Sequence[Study]) -> list[tuple[str, str]]:
@@ -180,13 +173,12 @@ def _differences(runs: Sequence[Run], against: Sequence[Run]) -> Mapping[str, An
         {run.identity.seed: run.final for run in cell if run.finished} for cell in (runs, against)
     )
     seeds = [seed for seed in ours if seed in theirs]
+    every = {run.identity.seed for run in (*runs, *against)}
     return {
         "pairs": len(seeds),
         "seeds": " ".join(map(str, seeds)),
         **difference_summary([ours[seed] - theirs[seed] for seed in seeds]),
-        "without_pair": " ".join(
-            str(run.identity.seed) for run in runs if run.identity.seed not in seeds
-        ),
+        "without_pair": " ".join(map(str, sorted(every - set(seeds)))),
     }
 
 

@@ -16,11 +16,12 @@ from torchrl_l1.report.published import Curves, ReferenceCurves
 from torchrl_l1.report.runs import Run
 from torchrl_l1.report.study import Cell, Study, place_columns
 from torchrl_l1.report.style import (
+    Look,
     arm_label,
-    color,
     fit_scale,
     grid,
     legend_below,
+    looks,
     named,
     save,
     title,
@@ -117,7 +118,8 @@ def plot_task(
     panels = []
     for noise, lines in main_lines(study, task):
         heading = named(name, title(task, noise))
-        authors = _authors(reference, task, noise)
+        usual = lines[0].runs[0].identity.usual_task
+        authors = _authors(reference, task, noise) if usual else []
         earlier = len(study.facts.named_stages[:-1])
         panels.append(Panel(heading, lines, authors, stage_bands(study, lines)[:earlier]))
     return plot_panels(panels, file)
@@ -139,18 +141,17 @@ def main_lines(study: Study, task: str) -> Iterator[tuple[str, list[Line]]]:
     cells = [cell for cell in study.cells if cell.task == task and not cell.variant]
     for noise in dict.fromkeys(cell.noise for cell in cells):
         chosen = [cell for cell in cells if cell.noise == noise]
+        drawn_as = looks([cell.arm for cell in chosen])
         yield (
             noise,
-            [
-                cell_line(study, cell, arm_label(cell.arm), color(3 + i, cell.arm))
-                for i, cell in enumerate(chosen)
-            ],
+            [cell_line(study, cell, arm_label(cell.arm), drawn_as[cell.arm]) for cell in chosen],
         )
 
 
-def cell_line(study: Study, cell: Cell, label: str, shade: str) -> Line:
+def cell_line(study: Study, cell: Cell, label: str, look: Look) -> Line:
     """The curves of a cell."""
-    return Line(label, shade, study.cells[cell], mean_action=study.facts.mean_action_stages)
+    mean_action = study.facts.mean_action_stages
+    return Line(label, look.color, study.cells[cell], mean_action, look.style)
 
 
 def stage_bands(study: Study, lines: Sequence[Line]) -> list[Band]:

@@ -20,11 +20,13 @@ from torchrl_l1.report.identity import BASELINE
 from torchrl_l1.report.page import Row
 from torchrl_l1.report.study import noise_order
 from torchrl_l1.report.style import (
+    Look,
     arm_label,
     color,
     fit_scale,
     grid,
     legend_below,
+    looks,
     named,
     save,
     title,
@@ -167,6 +169,7 @@ def plot_disturbances(
     while panels[-1] is None:
         panels.pop()
     figure, every = grid(len(panels), columns=columns, width=5.2, height=3.2)
+    drawn_as = looks(dict.fromkeys(row["l1"] for row in rows))
     axes, returns = [], []
     scaled: list[Sequence[float]] = []
     for axis, panel in zip(every, panels, strict=True):
@@ -174,7 +177,7 @@ def plot_disturbances(
             axis.set_visible(False)
             continue
         name, what, chosen, value = panel
-        limits = _draw_disturbance(axis, what, chosen, value)
+        limits = _draw_disturbance(axis, what, chosen, value, drawn_as)
         axis.set_title(name, fontsize=10)
         axes.append(axis)
         if value is shown[0]:
@@ -207,7 +210,7 @@ def _panel_title(actions: str, noise: str) -> str:
 
 
 def _draw_disturbance(
-    axis: Axes, what: str, rows: Sequence[Row], value: Columns
+    axis: Axes, what: str, rows: Sequence[Row], value: Columns, drawn_as: Mapping[str, Look]
 ) -> list[Sequence[float]]:
     """Draw a panel of returns or differences; returns its values and lower limits."""
     shown: list[Sequence[float]] = []
@@ -216,11 +219,11 @@ def _draw_disturbance(
         if not mine:
             continue
         line = sorted(mine, key=lambda row: row[what])
-        shade = color(3 + index, tested)
+        shade, marker = drawn_as[tested].color, drawn_as[tested].marker
         values = [row[value.line] for row in line]
         axis.plot(
             [row[what] for row in line], values, color=shade, label=arm_label(tested),
-            marker="o", markersize=max(8 - 2 * index, 2), linestyle=_OVER[min(index, 3)],
+            marker=marker, markersize=max(8 - 2 * index, 2), linestyle=_OVER[min(index, 3)],
         )  # fmt: skip
         shown.append(values)
         limits = [row for row in line if row.get(value.low) is not None]
@@ -344,7 +347,8 @@ def _draw(
         mine = [row for row in rows if (row["option"], row[other]) == line and y in row]
         mine.sort(key=lambda row: row[x])
         shade = color(1 + index % _COLORS)
-        marker = _MARKERS[index % len(_MARKERS)]
+        # Where colours come again they do so with other markers.
+        marker = _MARKERS[(index + index // _COLORS) % len(_MARKERS)]
         aside = np.exp(step * (index - (len(lines) - 1) / 2))
         axis.plot(
             [aside * places[row[x]] for row in mine],

@@ -29,6 +29,7 @@ from torchrl_l1.report.page import (
     number,
     paper_text,
     return_text,
+    values_text,
 )
 from torchrl_l1.report.published import published_cell
 from torchrl_l1.report.reading import Evaluation, condition_columns
@@ -40,6 +41,7 @@ from torchrl_l1.report.recovery import (
     recovery_columns,
     recovery_section,
     training_cells,
+    training_seeds,
     varied,
 )
 from torchrl_l1.report.runs import Run
@@ -75,7 +77,20 @@ def evaluation_sections(page: Page, study: Study) -> None:
             if robust and name in special and name != "ablation":
                 recovery_section(page, study.facts, name, rows)
             _tuning(page, study.facts, name, rows)
+            page.text(_drawn_apart(rows))
             page.csv(name, rows)
+
+
+def _drawn_apart(rows: Sequence[Row]) -> str:
+    """Where the settings of an evaluation have changed before it was through with all runs."""
+    columns = ("episodes_per_seed", "evaluation_seeds")
+    mixed = [row for row in rows if any(" " in row[column] for column in columns)]
+    if not mixed:
+        return ""
+    return (
+        f"In {len(mixed)} of {len(rows)} rows of the CSV policies were tested over other episodes "
+        "than each other: `episodes_per_seed` has their numbers, `evaluation_seeds` their seeds."
+    )
 
 
 def _sim_to_real(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> None:
@@ -320,6 +335,9 @@ def _summary(tests: Sequence[tuple[Run, Evaluation]]) -> dict[str, Any]:
     result: dict[str, Any] = {
         "training_seeds": len(values),
         "episodes_per_seed": " ".join(sorted({str(test.episodes) for _, test in tests})),
+        "evaluation_seeds": " ".join(
+            sorted({str(test.seed) for _, test in tests if test.seed is not None})
+        ),
         "return_mean": mean.pop("return_mean"),
         "std": float(np.std(values)),
         "return_values": " ".join(f"{value:.6g}" for value in values),
@@ -386,7 +404,7 @@ def evaluation_table(rows: Sequence[Row]) -> str:
     lines = []
     for _, found in grouped(rows, keys, "l1"):
         first = next(iter(found.values()))
-        line = _place(first, names) | {"training seeds": _seeds(found)}
+        line = _place(first, names) | {"training seeds": training_seeds(found)}
         line |= {arm_label(l1): return_text(found.get(l1)) for l1 in tested}
         on = [l1 for l1 in tested if l1 != BASELINE]
         line |= {f"{arm_label(l1)} less off": difference_text(found.get(l1, {})) for l1 in on}
@@ -394,12 +412,6 @@ def evaluation_table(rows: Sequence[Row]) -> str:
         line |= {f"paper, L1 {l1}": paper_text(found.get(l1, {}), notes) for l1 in tested}
         lines.append(line)
     return notes.below(markdown(lines))
-
-
-def _seeds(tests: Mapping[str, Row]) -> str:
-    """How many training seeds there are; of each test, in their order, where that differs."""
-    numbers = [str(row["training_seeds"]) for row in tests.values()]
-    return ", ".join(numbers if len(set(numbers)) > 1 else numbers[:1])
 
 
 def tuning_table(rows: Sequence[Row]) -> str:
@@ -455,7 +467,9 @@ def ablation_table(rows: Sequence[Row]) -> str:
     for cell, found in grouped(rows, keys, "phase"):
         line = dict(zip(keys, cell, strict=True))
         line |= {where: return_text(found.get(where)) for where in L1_IN}
-        line["training seeds"] = _seeds(found)
+        line["training seeds"] = values_text(
+            {where: str(row["training_seeds"]) for where, row in found.items()}
+        )
         line |= {f"paper, {where}": paper_text(found.get(where, {}), notes) for where in L1_IN}
         lines.append(line)
     return notes.below(markdown(lines))

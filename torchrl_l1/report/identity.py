@@ -13,7 +13,8 @@ from omegaconf import OmegaConf
 from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.control.config import DEFAULT_ALPHA
 from torchrl_l1.experiment.l1_options import OFF, closest_option, departures, filter_gain
-from torchrl_l1.experiment.recipes import shared_dir
+from torchrl_l1.experiment.launch import compose
+from torchrl_l1.experiment.recipes import available_recipes, shared_dir
 from torchrl_l1.experiment.settings import (
     SCHEMAS,
     VOLATILE_KEYS,
@@ -47,6 +48,8 @@ _NOT_COMPARED = (*_VOLATILE, "seed", "task", "threads", "device", "compile_plans
 # Two ways to give the gain of the filter, which is compared under the first of these names.
 _FILTER_KEYS = ("l1.alpha", "l1.cutoff")
 _NOISE_KEYS = ("perturbation.action_noise", "perturbation.observation_noise")
+# With the disturbances, what makes another task of the one that is named.
+_TASK_KEYS = ("dt", "horizon", "reward", "termination")
 
 
 @dataclass(frozen=True)
@@ -89,10 +92,25 @@ class Identity:
         return self.shared.get("model.form", "nonlinear")
 
     @property
+    def usual_task(self) -> bool:
+        """Whether nothing but noise disturbs, and steps, episodes and rewards are the task's."""
+        return all(
+            value == default_text(key, self.algorithm)
+            for key, value in self.shared.items()
+            if key in _TASK_KEYS or key.startswith("perturbation.")
+        )
+
+    @property
     def as_published(self) -> bool:
-        """Whether the published tables are of such runs: algorithm, model and controller."""
-        affine = self.model_form == "affine"
-        return "training" in facts(self.algorithm).tables and not affine and not self.departures
+        """Whether the published tables are of such runs: algorithm, task, model, controller."""
+        usual = self.usual_task and self.model_form != "affine" and not self.departures
+        return usual and "training" in facts(self.algorithm).tables
+
+    @property
+    def recipe_departures(self) -> dict[str, str]:
+        """Settings, but for those of the controller, in which it departs from a shipped recipe."""
+        usual = _recipe_settings(self.shared.get("recipe", ""))
+        return {k: v for k, v in self.shared.items() if k in usual and v != usual[k]}
 
 
 def identify(config: Mapping[str, Any]) -> Identity:
@@ -114,7 +132,7 @@ def identify(config: Mapping[str, Any]) -> Identity:
     arm = closest_option(controller, task, by_filter=False)
     closest = closest_option(controller, task)
     compared = {
-        _clean(key): _text(value)
+        clean(key): _text(value)
         for key, value in settings.items()
         if key not in (*_NOT_COMPARED, *_NOISE_KEYS, *_FILTER_KEYS)
         and key.split(".")[0] not in _VOLATILE
@@ -134,6 +152,16 @@ def identify(config: Mapping[str, Any]) -> Identity:
         departures={f"l1.{key}": _text(value) for key, value in departed.items()},
         shipped="" if on and departures(controller, closest, task) else closest,
     )
+
+
+@cache
+def _recipe_settings(recipe: str) -> dict[str, str]:
+    if recipe not in available_recipes():
+        return {}
+    settings = OmegaConf.to_container(compose(recipe, ["run_dir=unused"]), resolve=True)
+    flat = flatten(settings)
+    del flat["search_path"]  # where the user's code lies
+    return {key: _text(value) for key, value in flat.items()}
 
 
 def default_text(key: str, algorithm: str) -> str | None:
@@ -169,14 +197,14 @@ def _noises() -> dict[str, dict[str, Any]]:
 def _text(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
-    return _clean(str(value))
+    return clean(str(value))
 
 
-def _clean(text: str) -> str:
+def clean(text: str) -> str:
     """Text that is text in Markdown, too: it goes into tables, headings and legends.
 
     Examples:
-        >>> _clean("a <b> | [c](d)")
+        >>> clean("a <b> | [c](d)")
         'a ?b? ? [c] (d)'
     """
     return re.sub(r"[^\w .,:;=+*/()\[\]{}'\"@%~^&#!?$-]", "?", text).replace("](", "] (")

@@ -147,6 +147,23 @@ def markdown(rows: Sequence[Mapping[str, str]]) -> str:
     return "\n".join(lines)
 
 
+def values_text(values: Mapping[str, str]) -> str:
+    """What several have in common, or where it differs what each of them has.
+
+    Examples:
+        >>> values_text({"PETS": "15", "DETS": "15"})
+        '15'
+        >>> values_text({"METRPO": "19", "PETS": "15", "DETS": "15"})
+        '19 (METRPO), 15 (PETS, DETS)'
+    """
+    names: dict[str, list[str]] = {}
+    for name, value in values.items():
+        names.setdefault(value, []).append(name)
+    if len(names) < 2:
+        return "".join(names)
+    return ", ".join(f"{value} ({', '.join(found)})" for value, found in names.items())
+
+
 class Footnotes:
     """Numbered notes below a table; equal ones share their number."""
 

@@ -28,13 +28,18 @@ SWITCH_RATE = "l1/switch_rate"
 SIGNALS = (SWITCH_RATE, "l1/u_a", "l1/saturation")
 """Columns of a metrics table that only runs with L1 have."""
 
+AGAIN = "Move the run directory away, or run it again"
+"""What to do about a run whose files are damaged."""
+
+_EVALUATE_AGAIN = "Delete it and start its campaign again"
+
 # No table of a run comes near; more would be read into memory whole.
 _MOST_BYTES = 200_000_000
 
 _METRICS = ("iteration", "real_steps", "return_mean", "return_deterministic")
 
 
-def read_metrics(file: Path, stages: int = 0) -> dict[str, np.ndarray]:
+def read_metrics(file: Path, stages: int = 0, remedy: str = AGAIN) -> dict[str, np.ndarray]:
     """Columns of a metrics table; empty ones for a run that has only just begun.
 
     Those of :data:`SIGNALS` are NaN where the run has none.
@@ -42,9 +47,10 @@ def read_metrics(file: Path, stages: int = 0) -> dict[str, np.ndarray]:
     Args:
         file: the table.
         stages: of the algorithm; with any, there is a column ``stage``.
+        remedy: what an error says to do about it.
     """
     numbers = (*_METRICS, "stage") if stages else _METRICS
-    rows = checked_rows(file, numbers, optional=SIGNALS) if file.exists() else []
+    rows = checked_rows(file, numbers, optional=SIGNALS, remedy=remedy) if file.exists() else []
     columns = {name: np.array([row[name] for row in rows]) for name in (*numbers, *SIGNALS)}
     if not np.array_equal(columns["iteration"], np.arange(len(rows))):
         raise RunDirectoryError(f"{file}: the iterations are not 0, 1, 2, ... without a gap")
@@ -80,7 +86,7 @@ class Evaluation(Condition):
     """A condition with the returns of a run's frozen policy under it.
 
     Attributes:
-        return_mean: mean return over the episodes.
+        return_mean: mean return over the episodes; not finite where theirs are not.
         episodes: their number.
         own_l1: whether the controller was the one of the training; ``None`` in tables that are
             older than this column.
@@ -133,19 +139,19 @@ def read_evaluations(file: Path) -> list[Evaluation]:
         RunDirectoryError: if a file cannot be read, or says two things of one condition.
     """
     optional = ("own_l1", *MEASURED.values())
-    rows = _each_once(file, _condition_rows(file, ("return_mean", "episodes"), optional))
+    rows = _each_once(file, _condition_rows(file, ("episodes",), optional, ("return_mean",)))
     singly: dict[tuple[Any, ...], list[float]] = {}
     episodes = episodes_file(file)
     if episodes.exists():
         # The episodes of older tables may have no numbers.
-        for row in _each_once(episodes, _condition_rows(episodes, ("return",), ("episode",))):
+        for row in _each_once(episodes, _condition_rows(episodes, (), ("episode",), ("return",))):
             singly.setdefault(_condition_key(row), []).append(row["return"])
     for row in rows:
         found = singly.get(_condition_key(row), [])
-        if found and not _is_mean(row, found):
+        if found and math.isfinite(row["return_mean"]) and not _is_mean(row, found):
             raise RunDirectoryError(
                 f"{episodes} is not of {file}: its episodes of L1 {row['l1']} have another mean or "
-                "number than the table says; evaluate the run again"
+                f"number than the table says. {_EVALUATE_AGAIN}"
             )
     return [
         Evaluation(
@@ -187,13 +193,13 @@ def _each_once(file: Path, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any
         if str(found.setdefault(key, row)) != str(row):  # NaN is equal to itself here
             raise RunDirectoryError(
                 f"{file}, line {index + 2}: what it says of L1 {row['l1']} under these conditions "
-                "is not what a line before it says; evaluate the run again"
+                f"is not what a line before it says. {_EVALUATE_AGAIN}"
             )
     return list(found.values())
 
 
 def _condition_rows(
-    file: Path, numbers: Sequence[str], optional: Sequence[str] = ()
+    file: Path, numbers: Sequence[str], optional: Sequence[str], results: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Rows with the columns of conditions and others; disturbances as far as there are any."""
     later = tuple(name for name in DISTURBANCES if name not in _FIRST_DISTURBANCES)
@@ -204,6 +210,8 @@ def _condition_rows(
         (*_TUNED, *optional),
         ("stage",),
         later,
+        results,
+        _EVALUATE_AGAIN,
     )
 
 
@@ -240,16 +248,18 @@ def checked_rows(
     optional: Sequence[str] = (),
     optional_words: Sequence[str] = (),
     if_any: Sequence[str] = (),
+    results: Sequence[str] = (),
+    remedy: str = AGAIN,
 ) -> list[dict[str, Any]]:
     """As :func:`numeric_rows`, of a file of a run directory.
 
     Raises:
-        RunDirectoryError: in its place, with what to do about it.
+        RunDirectoryError: in its place, with what to do about it, the ``remedy``.
     """
     try:
-        return numeric_rows(file, numbers, words, optional, optional_words, if_any)
+        return numeric_rows(file, numbers, words, optional, optional_words, if_any, results)
     except ValueError as error:
-        raise RunDirectoryError(f"{error}. Move the run directory away, or run it again") from error
+        raise RunDirectoryError(f"{error}. {remedy}") from error
 
 
 def read_versions(file: Path) -> dict[str, str]:
@@ -272,6 +282,7 @@ def numeric_rows(
     optional: Sequence[str] = (),
     optional_words: Sequence[str] = (),
     if_any: Sequence[str] = (),
+    results: Sequence[str] = (),
 ) -> list[dict[str, Any]]:
     """Some columns of a CSV file.
 
@@ -282,6 +293,7 @@ def numeric_rows(
         optional: columns of numbers that may be absent, empty or not finite: NaN then.
         optional_words: columns of text that may be absent or empty.
         if_any: columns that are left out if absent or empty, else of finite numbers.
+        results: columns of numbers that may be infinite or NaN.
 
     Raises:
         ValueError: if the file cannot be read, a column is missing, a line has more values than
@@ -292,10 +304,11 @@ def numeric_rows(
         header = next(reader, [])
         columns = len(header)
         place = {name: index for index, name in enumerate(header)}
-        twice = [k for k in (*words, *numbers, *optional, *if_any) if header.count(k) > 1]
+        every = (*words, *numbers, *results, *optional, *if_any)
+        twice = [k for k in every if header.count(k) > 1]
         if twice:
             raise ValueError(f"{file} has the column {', '.join(twice)} twice")
-        missing = [k for k in (*words, *numbers) if k not in place]
+        missing = [k for k in (*words, *numbers, *results) if k not in place]
         if missing:
             raise ValueError(f"{file} has no column {', '.join(missing)}")
         rows = [row for row in reader if row]
@@ -316,6 +329,8 @@ def numeric_rows(
         found[key] = [_word(file, i, key, text) for i, text in enumerate(column(key), start=2)]
     for key in (*numbers, *(key for key in if_any if any(column(key)))):
         found[key] = [_number(file, i, key, text) for i, text in enumerate(column(key), start=2)]
+    for key in results:
+        found[key] = [_result(file, i, key, text) for i, text in enumerate(column(key), start=2)]
     for key in optional:
         found[key] = [_value(text) for text in column(key)]
     for key in optional_words:
@@ -342,6 +357,13 @@ def _number(file: Path, line: int, key: str, text: str | None) -> float:
     if math.isnan(value):
         raise ValueError(f"{file}, line {line}: {key} is {text!r}, not a finite number")
     return value
+
+
+def _result(file: Path, line: int, key: str, text: str | None) -> float:
+    try:
+        return float(text or "")
+    except ValueError:
+        raise ValueError(f"{file}, line {line}: {key} is {text!r}, not a number") from None
 
 
 def _value(text: str | None) -> float:

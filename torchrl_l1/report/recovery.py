@@ -16,7 +16,16 @@ from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.l1_options import UNTUNED
 from torchrl_l1.experiment.matrix import disturbance_words, disturbed
-from torchrl_l1.report.page import Page, Row, grouped, interval_text, markdown, number, spread_text
+from torchrl_l1.report.page import (
+    Page,
+    Row,
+    grouped,
+    interval_text,
+    markdown,
+    number,
+    spread_text,
+    values_text,
+)
 from torchrl_l1.report.statistics import recovered
 from torchrl_l1.report.study import noise_order
 from torchrl_l1.report.style import (
@@ -152,11 +161,12 @@ def robustness_table(rows: Sequence[Row]) -> str:
     lines = []
     for _, found in grouped(sorted(rows, key=by_disturbance), tuple(DISTURBANCES), "l1"):
         first = next(iter(found.values()))
-        line = {"disturbance": disturbance_words(first)}
+        line = {"disturbance": disturbance_words(first), "training seeds": training_seeds(found)}
         line |= {arm_label(l1): _return_text(found.get(l1), len(lengths) > 1) for l1 in tested}
-        gap = next((row for row in found.values() if "gap" in row), {})
         line["oracle less off"] = "–"
-        if gap:
+        gaps = [row for row in found.values() if "gap" in row]
+        if gaps:
+            gap = max(gaps, key=lambda row: row["recovered_policies"])
             line["oracle less off"] = f"{number(gap['gap'])} {interval_text(gap, 'gap')}"
         line |= {
             f"{arm_label(l1)} recovered": recovered_text(found.get(l1, {}))
@@ -165,6 +175,11 @@ def robustness_table(rows: Sequence[Row]) -> str:
         }
         lines.append(line)
     return markdown(lines)
+
+
+def training_seeds(tests: Mapping[str, Row]) -> str:
+    """How many training seeds the controllers were tested with; of each, where that differs."""
+    return values_text({arm_label(l1): str(row["training_seeds"]) for l1, row in tests.items()})
 
 
 def _return_text(row: Row | None, with_steps: bool) -> str:

@@ -18,9 +18,11 @@ from torchrl_l1.campaign.description import load_yaml
 from torchrl_l1.experiment.errors import RunDirectoryError, message
 from torchrl_l1.experiment.evaluate import table_checksums
 from torchrl_l1.experiment.files import read_text
+from torchrl_l1.experiment.matrix import disturbance_words
 from torchrl_l1.experiment.run_directory import RunDirectory, run_directories
 from torchrl_l1.report.identity import Identity, facts, identify
 from torchrl_l1.report.reading import (
+    AGAIN,
     SIGNALS,
     Evaluation,
     distinct_policies,
@@ -59,6 +61,7 @@ class Run:
         stage: number ``(T,)`` of the stage that each outer iteration belongs to, from 1; ``None``
             where the algorithm has one only.
         diverged: what is no longer finite in its training; empty if all is well.
+        lost: whether its metrics cannot be used; it has no iteration then.
     """
 
     path: Path
@@ -72,6 +75,7 @@ class Run:
     evaluations: dict[str, list[Evaluation]] = field(default_factory=dict)
     stage: np.ndarray | None = None
     diverged: str = ""
+    lost: bool = False
 
     @property
     def finished(self) -> bool:
@@ -80,8 +84,10 @@ class Run:
 
     @property
     def progress(self) -> str:
-        """How far it is, such as ``7 of 33``."""
-        return f"{len(self.returns)} of {self.identity.outer_iterations}"
+        """How far it is, such as ``7 of 33 iterations``, or what has become of it."""
+        if self.lost:
+            return "diverged" if self.diverged else "cannot be read"
+        return f"{len(self.returns)} of {self.identity.outer_iterations} iterations"
 
     @property
     def ending(self) -> np.ndarray:
@@ -155,9 +161,11 @@ class Findings:
         runs: those that can be read, in alphabetical order of their paths.
         errors: what is wrong with the files that cannot be read; each names its file. Of a run
             with such an evaluation, ``timing.csv`` or ``versions.json`` the rest is in ``runs``.
+        lost: those of which no more can be read than what they are of.
     """
 
     runs: list[Run] = field(default_factory=list)
+    lost: list[Run] = field(default_factory=list)
     errors: list[RunDirectoryError] = field(default_factory=list)
 
 
@@ -193,7 +201,8 @@ def find_readable_runs(folders: Sequence[Path]) -> Findings:
             try:
                 if isinstance(config, RunDirectoryError):
                     raise config
-                found.runs.append(_read(RunDirectory(path), config, found.errors))
+                run = _read(RunDirectory(path), config, found.errors)
+                (found.lost if run.lost else found.runs).append(run)
             except RunDirectoryError as error:
                 found.errors.append(error)
     if not found.runs:
@@ -206,7 +215,9 @@ def find_readable_runs(folders: Sequence[Path]) -> Findings:
     return found
 
 
-def _read_table(file: Path, iterations: int | None) -> list[Evaluation]:
+def _read_table(
+    file: Path, iterations: int | None, errors: list[RunDirectoryError]
+) -> list[Evaluation]:
     """An evaluation whose name is a word, as campaigns ask for: it goes into names and headings.
 
     One that was made before a run has gone on is of another policy than the run's last.
@@ -215,6 +226,7 @@ def _read_table(file: Path, iterations: int | None) -> list[Evaluation]:
         file: the table.
         iterations: of the run; of one that is not finished ``None`` will do: its tables enter
             nothing.
+        errors: returns that are not finite join these; the other rows are as good as ever.
     """
     if not re.fullmatch(r"[A-Za-z0-9_.+-]{1,100}", file.stem):
         raise RunDirectoryError(f"cannot use {file}: its name is no word of at most 100 letters")
@@ -235,7 +247,17 @@ def _read_table(file: Path, iterations: int | None) -> list[Evaluation]:
             f"{file} was made after {made_after} iterations, and the run has {iterations}; its "
             "campaign makes it again"
         )
-    return [replace(test, seed=seed) for test in read_evaluations(file)]
+    tests = read_evaluations(file)
+    for test in tests:
+        if not math.isfinite(test.return_mean):
+            condition = f"L1 {test.controller}, noise {test.noise}, {test.policy} policy"
+            errors.append(
+                RunDirectoryError(
+                    f"{file}: the return is {test.return_mean} with {condition}, "
+                    f"{disturbance_words(test.columns())}"
+                )
+            )
+    return [replace(test, seed=seed) for test in tests if math.isfinite(test.return_mean)]
 
 
 def _diverged(file: Path) -> str:
@@ -245,6 +267,23 @@ def _diverged(file: Path) -> str:
         raise RunDirectoryError(f"cannot read {file}: {error}") from error
 
 
+def _read_columns(
+    directory: RunDirectory, identity: Identity, stages: int, diverged: str
+) -> dict[str, np.ndarray]:
+    if problem := directory.metrics_problem():
+        raise RunDirectoryError(problem)
+    # Run again, it would diverge again: what is told is when and in what, and no remedy.
+    remedy = f"Its {diverged}" if diverged else AGAIN
+    columns = read_metrics(directory.metrics_file, stages, remedy)
+    iterations = len(columns["iteration"])
+    if iterations > identity.outer_iterations:
+        raise RunDirectoryError(
+            f"{directory.metrics_file} has {iterations} iterations, but "
+            f"{directory.config_file} says {identity.outer_iterations}"
+        )
+    return columns
+
+
 def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirectoryError]) -> Run:
     try:
         identity = identify(config)
@@ -252,20 +291,6 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
     # A damaged configuration may hold anything anywhere.
     except Exception as error:
         raise RunDirectoryError(f"cannot use {directory.config_file}: {message(error)}") from error
-    if problem := directory.metrics_problem():
-        raise RunDirectoryError(problem)
-    try:
-        columns = read_metrics(directory.metrics_file, len(algorithm.named_stages))
-    except RunDirectoryError as error:
-        # Returns of no number enter no mean: it is left out, but the reason is told.
-        why = _diverged(directory.diverged_file)
-        raise RunDirectoryError(f"{error} ({why})" if why else str(error)) from error
-    iterations = len(columns["iteration"])
-    if iterations > identity.outer_iterations:
-        raise RunDirectoryError(
-            f"{directory.metrics_file} has {iterations} iterations, but "
-            f"{directory.config_file} says {identity.outer_iterations}"
-        )
 
     def readable(read: Callable[[], T], otherwise: T) -> T:
         try:
@@ -274,11 +299,17 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
             errors.append(error)
             return otherwise
 
-    path = directory.path
+    path, stages = directory.path, len(algorithm.named_stages)
+    diverged = readable(partial(_diverged, directory.diverged_file), "")
+    versions: dict[str, str] = readable(partial(read_versions, path / "versions.json"), {})
+    # As of a run that has only just begun.
+    lost = read_metrics(path / "no metrics", stages)
+    columns = readable(partial(_read_columns, directory, identity, stages, diverged), lost)
+    iterations = len(columns["iteration"])
     tables = sorted((path / "evaluations").glob("*.csv"))
     whole = iterations if iterations == identity.outer_iterations else None
     evaluations: dict[str, list[Evaluation]] = {
-        file.stem: readable(partial(_read_table, file, whole), []) for file in tables
+        file.stem: readable(partial(_read_table, file, whole, errors), []) for file in tables
     }
     return Run(
         path,
@@ -291,8 +322,9 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
             partial(read_seconds, directory.timing_file, iterations, tuple(algorithm.phases)),
             {phase: np.full(iterations, np.nan) for phase in algorithm.phases},
         ),
-        readable(partial(read_versions, path / "versions.json"), {}),
+        versions,
         {k: distinct_policies(tests, algorithm) for k, tests in evaluations.items() if tests},
         columns.get("stage"),
-        readable(partial(_diverged, directory.diverged_file), ""),
+        diverged,
+        columns is lost,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,12 @@ from torchrl_l1.report.page import (
     markdown,
     number,
     return_text,
+    values_text,
 )
 from torchrl_l1.report.runs import Run, l1_means
 from torchrl_l1.report.statistics import difference_summary, mean_summary
 from torchrl_l1.report.study import Study, place_columns, with_baselines
-from torchrl_l1.report.style import named, title
+from torchrl_l1.report.style import arm_label, named, title
 
 _L1_COLUMNS = ("switches_per_1000", "u_a")
 
@@ -119,12 +120,10 @@ def stage_table(rows: Sequence[Row]) -> str:
     for cell, found in grouped(rows, keys, "l1"):
         on = [arm for arm in arms if arm != BASELINE]
         line = dict(zip(keys, cell, strict=True))
-        line |= {
-            "real steps": ", ".join(dict.fromkeys(str(row["real_steps"]) for row in found.values()))
-        }
+        line["real steps"] = _each(found, "real_steps")
         line |= {f"L1 {arm}": return_text(found.get(arm)) for arm in arms}
         line |= {f"L1 {arm} less off": difference_text(found.get(arm, {})) for arm in on}
-        line["seeds"] = ", ".join(dict.fromkeys(str(row["seeds"]) for row in found.values()))
+        line["seeds"] = _each(found, "seeds")
         line["switches per 1000 steps"] = ", ".join(
             number(found[arm]["switches_per_1000"])
             for arm in on
@@ -132,6 +131,10 @@ def stage_table(rows: Sequence[Row]) -> str:
         )
         lines.append(line)
     return markdown(lines)
+
+
+def _each(found: Mapping[str, Row], column: str) -> str:
+    return values_text({arm_label(arm): str(row[column]) for arm, row in found.items()})
 
 
 def plot_stages(study: Study, task: str, file: Path, name: str = "") -> Path | None:

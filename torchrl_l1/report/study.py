@@ -12,7 +12,7 @@ import numpy as np
 
 from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.envs import TASKS
-from torchrl_l1.report.identity import ALGORITHMS, BASELINE, NOISES, default_text, facts
+from torchrl_l1.report.identity import ALGORITHMS, BASELINE, NOISES, clean, default_text, facts
 from torchrl_l1.report.reading import Evaluation
 from torchrl_l1.report.runs import Run
 
@@ -141,21 +141,45 @@ def studies(runs: Sequence[Run]) -> list[Study]:
     than some settings: they are not pooled, and are no variants of each other.
     """
     groups: dict[str, list[Run]] = {}
-    for run in runs:
+    for run in _with_changed_files(runs):
         groups.setdefault(run.identity.algorithm, []).append(run)
     return [Study(groups[name]) for name in ALGORITHMS if name in groups]
 
 
+def _with_changed_files(runs: Sequence[Run]) -> list[Run]:
+    """The runs with the digests of the user's files among their settings, where some differ.
+
+    Runs that are older than these digests have none.
+    """
+    digests = [{k: v for k, v in run.versions.items() if v.startswith("sha256 ")} for run in runs]
+    found: dict[str, set[str]] = {}
+    for file, digest in (item for one in digests for item in one.items()):
+        found.setdefault(file, set()).add(digest)
+    changed = [
+        {clean(file): clean(digest) for file, digest in one.items() if len(found[file]) > 1}
+        for one in digests
+    ]
+    return [
+        replace(run, identity=replace(run.identity, shared={**run.identity.shared, **own}))
+        for run, own in zip(runs, changed, strict=True)
+    ]
+
+
 def with_baselines(study: Study, runs: Sequence[Run]) -> tuple[list[tuple[Run, Run]], list[str]]:
-    """Each finished run with its finished baseline, and the seeds of the others."""
-    pairs, single = [], []
+    """Each finished run of a cell with its finished baseline, and the seeds of either without."""
+    pairs = []
     for run in runs:
         baseline = study.baseline_of(run)
         if run.finished and baseline is not None and baseline.finished:
             pairs.append((run, baseline))
-        else:
-            single.append(str(run.identity.seed))
-    return pairs, single
+    seeds = {
+        run.identity.seed
+        for run in study.runs
+        if run.identity.arm == BASELINE and _place_key(run) == _place_key(runs[0])
+    }
+    seeds |= {run.identity.seed for run in runs}
+    single = sorted(seeds - {run.identity.seed for run, _ in pairs})
+    return pairs, [str(seed) for seed in single]
 
 
 def place_columns(cell: Cell) -> dict[str, Any]:
@@ -211,9 +235,13 @@ def _merged_evaluations(best: Run, others: Sequence[Run]) -> dict[str, list[Eval
     return merged
 
 
-def _pairing_key(run: Run) -> tuple[object, ...]:
+def _place_key(run: Run) -> tuple[object, ...]:
     what = run.identity
-    return what.task, what.noise, what.seed, _frozen(what.shared)
+    return what.task, what.noise, _frozen(what.shared)
+
+
+def _pairing_key(run: Run) -> tuple[object, ...]:
+    return *_place_key(run), run.identity.seed
 
 
 def _frozen(settings: Mapping[str, str]) -> frozenset[tuple[str, str]]:

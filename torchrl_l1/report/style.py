@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +33,9 @@ _ARMS |= {"reference": "#E69F00", "slow": "#CC79A7"}
 _ARMS[ORACLE] = "#000000"
 _CYCLE = ("#D55E00", "#0072B2", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#000000")
 
+_STYLES: Sequence[Any] = ("-", "-.", (0, (6, 1, 1, 1, 1, 1)), (0, (1, 1)))
+_MARKERS = "osD^"
+
 _NOISES = {
     "none": "no noise",
     "action": "action noise",
@@ -42,6 +47,40 @@ _NOISES = {
 def color(index: int, arm: str | None = None) -> str:
     """Colour of an arm, or of the n-th of several lines."""
     return _ARMS.get(arm or "", _CYCLE[index % len(_CYCLE)])
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a line differs from the others of its figure.
+
+    Attributes:
+        color: of an arm its own, which no other line has.
+        style: as matplotlib takes it; another one, like the marker, where colours come again.
+        marker: at its points, where it has any.
+    """
+
+    color: str
+    style: Any = _STYLES[0]
+    marker: str = _MARKERS[0]
+
+
+def looks(names: Collection[str]) -> dict[str, Look]:
+    """How to draw several lines, by name, that of an arm or any other.
+
+    Examples:
+        >>> [look.color for look in looks(["off", "paper", "paper epsilon=0.3"]).values()]
+        ['#D55E00', '#0072B2', '#009E73']
+    """
+    arms = {name: Look(_ARMS[name]) for name in names if name in _ARMS}
+    taken = {look.color for look in arms.values()}
+    free = [
+        Look(shade, style, marker)
+        for style, marker in zip(_STYLES, _MARKERS, strict=False)
+        for shade in _CYCLE
+        if shade not in taken
+    ]
+    others = [name for name in names if name not in arms]
+    return arms | dict(zip(others, itertools.cycle(free), strict=False))
 
 
 def arm_label(arm: str) -> str:
@@ -63,9 +102,8 @@ def arm_style(arm: str, arms: Sequence[str]) -> Any:
         arm: the arm.
         arms: all of them.
     """
-    styles = ("-", "-.", (0, (6, 1, 1, 1, 1, 1)), (0, (1, 1)))
     on = [other for other in arms if other != BASELINE]
-    return "--" if arm == BASELINE else styles[on.index(arm) % len(styles)]
+    return "--" if arm == BASELINE else _STYLES[on.index(arm) % len(_STYLES)]
 
 
 def algorithm_label(name: str, arm: str) -> str:

@@ -34,7 +34,7 @@ from torchrl_l1.report.statistics import (
     published_spread,
 )
 from torchrl_l1.report.study import Cell, Study, place_columns, with_baselines
-from torchrl_l1.report.style import arm_label, color, named, title
+from torchrl_l1.report.style import arm_label, looks, named, title
 
 # More settings are told in the text and in the table, not in headings and legends.
 _MOST_KEYS, _LONGEST_LABEL = 6, 100
@@ -71,7 +71,7 @@ def _training(page: Page, study: Study, reference: ReferenceCurves | None) -> No
         + _l1_did(study),
     )
     page.text(training_table([row for cell, row in rows.items() if not cell.variant]))
-    page.text(_main_settings(study))
+    page.text(_main_settings(study), _recipe_departures(study))
     page.csv("training", list(rows.values()))
 
 
@@ -101,6 +101,21 @@ def _main_settings(study: Study) -> str:
     if not lines:
         return ""
     return "Runs with other settings than these have tables of their own:\n\n" + "\n".join(lines)
+
+
+def _recipe_departures(study: Study) -> str:
+    lines = []
+    for task in study.tasks():
+        # What main cells differ in is told above.
+        told = study.main_settings(task)
+        main = next(cell for cell in study.cells if cell.task == task and not cell.variant)
+        departures = study.cells[main][0].identity.recipe_departures
+        shown = [code(f"{key}={value}") for key, value in departures.items() if key not in told]
+        if shown:
+            lines.append(f"- {task}: {', '.join(shown)}")
+    if not lines:
+        return ""
+    return "In these settings all runs depart from their recipe:\n\n" + "\n".join(lines)
 
 
 def run_rows(study: Study) -> list[dict[str, Any]]:
@@ -143,7 +158,7 @@ def training_row(
         row["real_steps"] = round(float(np.mean([run.real_steps[-1] for run in done])))
         row |= l1_means(done, [run.ending for run in done])
     row["unfinished"] = "; ".join(
-        f"seed {run.identity.seed}: {run.progress} iterations" for run in runs if not run.finished
+        f"seed {run.identity.seed}: {run.progress}" for run in runs if not run.finished
     )
     what = runs[0].identity
     affine = what.model_form == "affine"
@@ -154,7 +169,8 @@ def training_row(
     if published is not None:
         row |= published.columns()
     curves = None
-    if reference is not None and affine and cell.noise == "none" and cell.arm == BASELINE:
+    plain = cell.noise == "none" and cell.arm == BASELINE and what.usual_task
+    if reference is not None and affine and plain:
         curves = reference.model_form(cell.task, "affine")
     elif reference is not None and published is not None:
         curves = reference.training(*place)
@@ -308,16 +324,17 @@ def plot_comparison(
     cells = [cell for cell in study.compared(keys) if cell.task == task]
     rows = {cell: row for row, cell in enumerate(study.compared(keys), start=1)}
     names = {cell: _name(study, cell, keys, rows[cell]) for cell in cells}
-    order = list(dict.fromkeys(names.values()))
+    drawn_as = looks(dict.fromkeys(names.values()))
     panels = []
     for noise in dict.fromkeys(cell.noise for cell in cells):
         lines = [
-            cell_line(study, cell, names[cell], color(order.index(names[cell])))
+            cell_line(study, cell, names[cell], drawn_as[names[cell]])
             for cell in cells
             if cell.noise == noise
         ]
         authors = []
-        if reference is not None and "model.form" in keys and noise == "none":
+        usual = any(run.identity.usual_task for line in lines for run in line.runs)
+        if reference is not None and "model.form" in keys and noise == "none" and usual:
             for form, style in (("nonlinear", "-"), ("affine", ":")):
                 curves = reference.model_form(task, form)
                 if curves is not None:
