@@ -176,6 +176,33 @@ def test_steps_that_are_not_finite_end_the_episode_and_are_told():
     assert data["next", "reward"][:, -1].eq(0).all()
 
 
+def test_a_reward_that_single_precision_cannot_hold_is_not_finite():
+    class Rich(Cart):
+        def step(self, action):
+            observation, _, *rest = super().step(action)
+            return observation, 1e39 if self.steps == 2 else 1.0, *rest
+
+    data = task_of(Rich).environment(2, seed=0).rollout(10)
+    assert data["next", "non_finite"][..., 0].tolist() == [[False, True]] * 2
+    assert data["next", "reward"][..., 0].tolist() == [[1.0, 0.0]] * 2
+
+
+def test_a_restart_by_mujoco_is_no_transition(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where MuJoCo logs what it warns of
+    env = get_task("gymnasium/InvertedPendulum-v5").environment(2, seed=0)
+    data = env.reset()
+    for spoilt in (["qvel"], ["qvel"], ["qpos", "qvel"], []):
+        before = data["observation"]
+        simulated = env.members[1].simulation().data
+        for part in spoilt:  # MuJoCo restarts from the pose of the XML, as often as it takes
+            getattr(simulated, part)[:] = np.nan
+        data = env.step(data.set("action", torch.ones(2, 1)))["next"]
+        assert data["non_finite"][:, 0].tolist() == [False, bool(spoilt)]
+        assert torch.equal(data["observation"][1], before[1]) == bool(spoilt)
+        assert not torch.equal(data["observation"][0], before[0])
+        assert np.isfinite(simulated.qpos).all()
+
+
 def test_actions_beyond_the_bounds_are_clipped():
     env = task_of(Cart).environment(1, seed=0)  # the cart itself takes no others
     state = env.reset()
