@@ -183,8 +183,8 @@ class ExternalEnv(CPUEnv):
     nothing that was before. Actions are clipped to the bounds, as an actuator would. Where an
     observation or reward is not finite, or MuJoCo's simulation turned bad, that step has
     ``("next", "non_finite")`` and ``("next", "terminated")`` set, its next observation repeats the
-    last good one and its reward is zero.
-    Environments that a ``"_step"`` mask leaves out stay as they are.
+    last good one and its reward is zero. Environments that a ``"_step"`` mask leaves out stay as
+    they are.
 
     Args:
         task: what the environments are.
