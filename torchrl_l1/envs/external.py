@@ -29,13 +29,10 @@ from torchrl_l1.envs.mujoco_env import (
 )
 from torchrl_l1.envs.plant import Plant, cannot_change, disturbed_model, survives_resets
 from torchrl_l1.envs.references import making
-from torchrl_l1.envs.simulation import turned_bad
+from torchrl_l1.envs.simulation import LARGEST, turned_bad
 from torchrl_l1.envs.single import PAGE, SingleEnv, SingleGymnasiumEnv, SingleTorchRLEnv
 from torchrl_l1.envs.sources import EnvironmentSource, environment_source
 from torchrl_l1.envs.task import BadAction, RewardFn, Scalars, Task
-
-# Rewards are kept in single precision, where larger ones are infinite.
-_LARGEST = float(np.finfo(np.float32).max)
 
 
 class ExternalTask:
@@ -276,7 +273,7 @@ class ExternalEnv(CPUEnv):
             observation, earned, terminated[index], truncated[index] = stepping
             inner = getattr(self.members[index].simulation(), "data", None)
             broke = isinstance(inner, mujoco.MjData) and turned_bad(inner)
-            bad[index] = broke or not (np.isfinite(observation).all() and abs(earned) <= _LARGEST)
+            bad[index] = broke or not (np.isfinite(observation).all() and abs(earned) <= LARGEST)
             if not bad[index]:
                 self._observation[index], reward[index] = observation, earned
         self._steps += chosen
