@@ -125,7 +125,17 @@ def test_first_sentences_of_the_study_quote_the_table() -> None:
         assert float(words[0]) == of[words[1].lower()] == extreme(of.values())
     harm = rows((RESULTS / "robust/harm.md").read_text())
     worst = min(float(row["L1 robust, %"].split()[0]) for row in harm)
-    assert f"at worst {-worst:.1f} % lower" in " ".join(first.split())
+    for text in (first, section("docs/studies/index.md", "## What should I switch on")):
+        assert f"at worst {-worst:.1f} % lower" in " ".join(text.split())
+    costs = {
+        (row["task"], row["noise"]): f"{-float(row['L1 paper, %'].split()[0]):.0f}" for row in harm
+    }
+    help_page = (ROOT / "docs/l1.md").read_text()
+    for words, noise, tasks in (
+        ("{}, {} and {} % (Hopper's", "action", ("half_cheetah", "walker", "hopper")),
+        ("{}, {} and {} % of their return", "observation", ("hopper", "walker", "half_cheetah")),
+    ):
+        assert words.format(*(costs[task, noise] for task in tasks)) in help_page
 
 
 @pytest.mark.parametrize("algorithm", ["METRPO", "MBMF"])
@@ -175,21 +185,23 @@ def test_cells_are_of_the_edition_with_most_pairs(
     pairs_of = dict(zip(questions.METRPO.editions, many, strict=True))
 
     def rows_of(edition: str, name: str) -> list[dict[str, str]]:
-        key = {"task": "swimmer", "noise": "none"}
+        key = {"task": "swimmer", "noise": "none", "variant": ""}
+        other = {"variant": "l1.epsilon=1"}
         if name == "training.csv":
-            return [key | {"l1": "off", "return_mean": "7"}]
+            off = key | {"l1": "off", "return_mean": "7"}
+            return [off, off | other | {"return_mean": "8"}]
         seeds = list(map(str, range(pairs_of[edition])))
         if name == "runs.csv":
             # One more without L1 than there are pairs.
             runs = [("off", seed) for seed in [*seeds, "9"]] + [("paper", seed) for seed in seeds]
             returns = {"off": 1.0, "paper": 2.0}
             return [
-                key
-                | {"l1": l1, "variant": "", "seed": seed, "return": str(returns[l1] + int(seed))}
+                key | {"l1": l1, "seed": seed, "return": str(returns[l1] + int(seed))}
                 for l1, seed in runs
             ]
         counted = {"pairs": str(len(seeds)), "seeds": " ".join(seeds)}
-        return [key | {"l1": "paper", "policy": "stochastic"} | counted]
+        pair = key | {"l1": "paper", "policy": "stochastic"} | counted
+        return [pair | other | {"seeds": "8"}, pair]
 
     monkeypatch.setattr(questions, "rows", rows_of)
     found = questions.ours(questions.METRPO, "swimmer", "none", "paper")
@@ -348,12 +360,17 @@ DISTURBANCES = {
 def test_suite_page_names_whatever_the_robust_controller_makes_worse() -> None:
     text = " ".join(section("docs/studies/suite.md", "**In short.**").split())
     first = text.partition("## ")[0].partition("The paper's")[0].replace("late sensor", "delays")
+    worse = set()
     for row in rows((RESULTS / "suite/verdicts.md").read_text()):
         for column, verdicts in row.items():
             if verdicts.endswith("/ worse"):
                 task = column.partition(" (")[0].title().replace(" ", "")
                 of_task = first.partition(task)[2]
                 assert DISTURBANCES[row["disturbance"]] in of_task, (task, row["disturbance"])
+                worse.add(DISTURBANCES[row["disturbance"]])
+    advice = section("docs/studies/index.md", "## What should I switch on").partition("`dead")[0]
+    for words in DISTURBANCES.values():
+        assert words in worse or words not in first + " ".join(advice.split()), words
 
 
 OTHER_POLICIES = {("920", "1333"), ("857", "759")}

@@ -9,6 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+LARGEST_BOUND = 1e9
+"""Beyond it a bound of the action is none: some packages write the largest float for infinity."""
+
 
 def check_within(name: str, value: float, interval: str) -> None:
     """Refuse a number outside an interval.

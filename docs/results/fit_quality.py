@@ -279,17 +279,18 @@ def draw(rows: Sequence[Row], file: Path) -> None:
     for axis, (plant, measure) in zip(axes, itertools.product(plants, shown), strict=True):
         of_plant = [row for row in rows if row["plant"] == plant]
         for arm, marker in zip(ARMS, "ox", strict=True):
-            x = [float(row[measure]) for row in of_plant]
+            x = [max(-1.0, float(row[measure])) for row in of_plant]
             y = [max(-1.0, float(row[arm])) for row in of_plant]
             axis.plot(x, y, marker, color=color(1 + ARMS.index(arm)), label=f"L1 {arm}", ms=4)
         if measure == "explained_mean":
-            axis.set_xlim(-1, 1.05)
+            axis.set_xlim(-1.05, 1.05)
         else:
             axis.set_xscale("log")
             axis.xaxis.set_major_locator(LogLocator(numticks=5))
         axis.axhline(0, color="0.6", lw=0.8)
         axis.set_title(plant, fontsize=9)
-        axis.set_xlabel(MEASURES[measure].split(",")[0], fontsize=8)
+        least = " (at least -1)" if measure == "explained_mean" else ""
+        axis.set_xlabel(MEASURES[measure].split(",")[0] + least, fontsize=8)
         axis.set_ylabel("share regained (at least -1)", fontsize=8)
     legend_below(figure, axes)
     save(figure, file)

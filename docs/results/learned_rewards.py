@@ -3,8 +3,8 @@
     python docs/results/learned_rewards.py [FOLDER]
 
 Reads `metrics.csv` of the runs in FOLDER/built_in/seed_N and FOLDER/learned/seed_N, if a FOLDER is
-given, and keeps what is shown of them in `learned_rewards.csv` beside this file. Writes from it
-`learned_rewards.md` and `learned_rewards.png`.
+given, and keeps what is shown of them in `learned_rewards.csv` beside this file, in place of what
+was kept of the same runs. Writes from it `learned_rewards.md` and `learned_rewards.png`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,10 @@ Row = dict[str, str]
 def gather(folder: Path) -> None:
     """Keep steps, returns and the fit of the reward of all runs in one file."""
     rows: list[Row] = []
-    for file in sorted(folder.glob("*/seed_*/metrics.csv")):
+    files = [file for reward in WORDS for file in folder.glob(f"{reward}/seed_*/metrics.csv")]
+    if not files:
+        sys.exit(f"no runs in {' or '.join(str(folder / reward) for reward in WORDS)}")
+    for file in files:
         own = {"reward": file.parts[-3], "seed": file.parts[-2].removeprefix("seed_")}
         with file.open(newline="") as handle:
             rows += [
@@ -37,26 +40,39 @@ def gather(folder: Path) -> None:
                 for row in csv.DictReader(handle)
                 if int(row["real_steps"]) <= MOST_STEPS
             ]
-    write_table(KEPT, rows)
+    new = {run_of(row) for row in rows}
+    old = [row for row in read() if run_of(row) not in new] if KEPT.exists() else []
+    write_table(KEPT, sorted(old + rows, key=run_of))
+
+
+def run_of(row: Row) -> tuple[str, str]:
+    """Reward and seed."""
+    return row["reward"], row["seed"]
+
+
+def read() -> list[Row]:
+    """The rows that are kept."""
+    with KEPT.open(newline="") as handle:
+        return list(csv.DictReader(handle))
 
 
 def main() -> None:
     """Read what is new, then write table and figure."""
     if len(sys.argv) > 1:
         gather(Path(sys.argv[1]))
-    with KEPT.open(newline="") as handle:
-        rows = list(csv.DictReader(handle))
+    rows = read()
     runs: dict[tuple[str, str], dict[int, Row]] = {}
     for row in rows:
-        runs.setdefault((row["reward"], row["seed"]), {})[int(row["real_steps"])] = row
+        runs.setdefault(run_of(row), {})[int(row["real_steps"])] = row
     table = []
     for steps in sorted({int(row["real_steps"]) for row in rows}):
         line = {"real steps": str(steps)}
         for (reward, seed), at in runs.items():
             returned = f"{float(at[steps]['return_mean']):.0f}" if steps in at else ""
             line[f"{WORDS[reward]}, seed {seed}"] = returned
-        explained = [at[steps]["explained_variance"] for at in runs.values() if steps in at]
-        line["explained variance"] = f"{min(float(one) for one in explained if one):.5f}"
+        found = [at[steps]["explained_variance"] for at in runs.values() if steps in at]
+        explained = [float(one) for one in found if one]
+        line["explained variance"] = f"{min(explained):.5f}" if explained else ""
         table.append(line)
     KEPT.with_suffix(".md").write_text(markdown(table) + "\n")
     figure, (axis,) = grid(1, 1, 6.4, 3.6)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import csv
 import sys
 from collections.abc import Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -65,9 +66,12 @@ def measured(folder: Path) -> list[Row]:
 
 
 def keep(rows: Sequence[Row], file: Path) -> None:
-    """One row for all episodes of a run, a controller and a bias, in order."""
+    """One row for all episodes of a run, a controller and a bias, in place of that run's."""
+    run_of = itemgetter("task", "quality", "seed")
+    new = {run_of(row) for row in rows}
+    old = [row for row in kept(file) if run_of(row) not in new] if file.exists() else []
     cells: dict[tuple[Any, ...], list[Row]] = {}
-    for row in rows:
+    for row in sorted([*old, *rows], key=run_of):
         cells.setdefault(tuple(row[name] for name in CELL), []).append(row)
     write_table(
         file,

@@ -3,8 +3,8 @@
     python docs/results/planners.py [FOLDER]
 
 Reads the episodes that `torchrl-l1 evaluate` wrote into FOLDER/pets and FOLDER/mbmf, if a FOLDER is
-given, and keeps their returns in `planners/episodes.csv` beside this file. Writes from those
-`planners/table.md`.
+given, and keeps their returns in `planners/episodes.csv` beside this file, in place of those of the
+same algorithm. Writes from those `planners/table.md`.
 """
 
 from __future__ import annotations
@@ -31,19 +31,30 @@ def read(file: Path) -> list[Row]:
         return list(csv.DictReader(handle))
 
 
+def gather(folder: Path) -> None:
+    """Keep the returns of all algorithms in one file."""
+    files = {name: folder / name / "episodes.csv" for name in ALGORITHMS}
+    if not any(file.exists() for file in files.values()):
+        sys.exit(f"no episodes in {' or '.join(map(str, files.values()))}")
+    kept = HERE / "episodes.csv"
+    before = read(kept) if kept.exists() else []
+    rows: list[Row] = []
+    for name, file in files.items():
+        if file.exists():
+            new = [{key: row[key] for key in KEPT} for row in read(file)]
+            rows += [{"algorithm": name, **row} for row in new]
+        else:
+            rows += [row for row in before if row["algorithm"] == name]
+    HERE.mkdir(exist_ok=True)
+    write_table(kept, rows)
+
+
 def main() -> None:
     """Read what is new, then write the table."""
-    kept = HERE / "episodes.csv"
     if len(sys.argv) > 1:
-        rows = []
-        for name in ALGORITHMS:
-            file = Path(sys.argv[1]) / name / "episodes.csv"
-            for row in read(file) if file.exists() else ():
-                rows.append({"algorithm": name, **{key: row[key] for key in KEPT}})
-        HERE.mkdir(exist_ok=True)
-        write_table(kept, rows)
+        gather(Path(sys.argv[1]))
     returns: dict[tuple[str, str, str], list[float]] = {}
-    for row in read(kept):
+    for row in read(HERE / "episodes.csv"):
         key = (row["algorithm"], row["bias"], row["l1"])
         returns.setdefault(key, []).append(float(row["return"]))
     lines = []

@@ -100,13 +100,14 @@ def ours(table: Table, task: str, noise: str, l1: str) -> Found | None:
         returns = {
             row["l1"]: row["return_mean"]
             for row in rows(edition, "training.csv")
-            if (row["task"], row["noise"]) == (task, noise)
+            if (row["task"], row["noise"]) == (task, noise) and not row["variant"]
         }
         pair = [
             row
             for row in rows(edition, "pairs.csv")
             if (row["task"], row["noise"], row["l1"]) == (task, noise, l1)
             and row["policy"] == "stochastic"
+            and not row["variant"]
             and int(row["pairs"])
         ]
         for arm in ("off", l1) if pair else ():

@@ -20,11 +20,12 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import TwoSlopeNorm
+from scipy.stats import t
 
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.files import write_table
 from torchrl_l1.report.page import markdown
-from torchrl_l1.report.statistics import Recovery, recovered
+from torchrl_l1.report.statistics import Interval, mean_interval
 
 HERE = Path(__file__).with_name("suite")
 TASKS = ("inverted_pendulum", "swimmer", "hopper", "walker", "half_cheetah")
@@ -86,77 +87,88 @@ def read(task: str) -> Returns:
         }
 
 
-def together(returns: Returns, l1: str, cells: Sequence[Cell]) -> list[np.ndarray]:
-    """Returns of each policy in several cells, one after the other."""
+def by_reset(returns: Returns, l1: str, cells: Sequence[Cell]) -> np.ndarray:
+    """Return from each reset: the mean over policies and over cells, whose resets are the same."""
     runs = sorted({key[0] for key in returns})
-    return [np.concatenate([returns[run, l1, cell] for cell in cells]) for run in runs]
+    return np.mean([returns[run, l1, cell] for run in runs for cell in cells], axis=0)
 
 
-def regained(returns: Returns, l1: str, cells: Sequence[Cell]) -> Recovery:
-    """What a controller gives back of what the disturbance takes."""
-    return recovered(
-        together(returns, "off", cells),
-        together(returns, l1, cells),
-        together(returns, "off", [NONE] * len(cells)),
-    )
+def interval_of(values: np.ndarray) -> Interval:
+    """95 % interval of the mean over resets, without bounds if these are fewer than three."""
+    return mean_interval(list(values)) or Interval(-np.inf, np.inf)
 
 
-def change(returns: Returns, l1: str, cells: Sequence[Cell]) -> tuple[float, float, float]:
-    """Return less that without L1, as a share of its scale, with its 95 % interval."""
-    on, off = (together(returns, one, cells) for one in (l1, "off"))
-    zero = [np.zeros_like(one) for one in off]
-    found = recovered(zero, zero, [a - b for a, b in zip(on, off, strict=True)])
-    size, interval = scale(returns, cells), found.gap_interval
-    return found.gap / size, interval.low / size, interval.high / size
+def change(returns: Returns, l1: str, cells: Sequence[Cell]) -> tuple[float, Interval]:
+    """Return less that without L1, as a share of its scale, with its interval."""
+    difference = by_reset(returns, l1, cells) - by_reset(returns, "off", cells)
+    shares = difference / scale(returns, cells)
+    return float(shares.mean()), interval_of(shares)
 
 
 def scale(returns: Returns, cells: Sequence[Cell]) -> float:
     """Magnitude of the undisturbed return without L1, or of the loss if that is larger."""
-    undisturbed = np.concatenate(together(returns, "off", [NONE])).mean()
-    disturbed = np.concatenate(together(returns, "off", cells)).mean()
-    return max(float(abs(undisturbed)), float(abs(undisturbed - disturbed)), STANDING)
+    undisturbed = by_reset(returns, "off", [NONE]).mean()
+    return max(float(abs(undisturbed)), float(abs(lost(returns, cells).mean())), STANDING)
+
+
+def lost(returns: Returns, cells: Sequence[Cell]) -> np.ndarray:
+    """What the disturbance costs without L1, by reset."""
+    return by_reset(returns, "off", [NONE]) - by_reset(returns, "off", cells)
+
+
+def regained(returns: Returns, l1: str, cells: Sequence[Cell]) -> tuple[float, Interval] | None:
+    """Share of what a disturbance costs that a controller gives back; none if it costs nothing."""
+    loss = lost(returns, cells)
+    if interval_of(loss).low <= 0 or loss.mean() <= LEAST * scale(returns, cells):
+        return None
+    return ratio(by_reset(returns, l1, cells) - by_reset(returns, "off", cells), loss)
+
+
+def ratio(above: np.ndarray, below: np.ndarray) -> tuple[float, Interval]:
+    """Of two means over the same resets, with Fieller's 95 % interval.
+
+    Those are the ratios r for which Student's t test does not tell the mean of above - r below
+    from 0: a share is told from 0 where its gain is.
+    """
+    count = len(below)
+    means = np.array([above.mean(), below.mean()])
+    # They are where (1, -r) c (1, -r)' <= 0.
+    c = np.outer(means, means) - t.ppf(0.975, count - 1) ** 2 / count * np.cov(above, below)
+    half = np.sqrt(max(c[0, 1] ** 2 - c[0, 0] * c[1, 1], 0.0))
+    low, high = (c[0, 1] - half) / c[1, 1], (c[0, 1] + half) / c[1, 1]
+    return float(means[0] / means[1]), Interval(float(low), float(high))
 
 
 def verdict(returns: Returns, l1: str, cells: Sequence[Cell]) -> str:
     """What the controller does about a disturbance, in a word or two."""
-    mean, low, high = change(returns, l1, cells)
-    if high < 0 and mean < -LEAST:
+    mean, interval = change(returns, l1, cells)
+    if interval.high < 0 and mean < -LEAST:
         return "worse"
-    if not (low > 0 and mean > LEAST):
+    if not (interval.low > 0 and mean > LEAST):
         return "not touched"
     back = regained(returns, l1, cells)
-    whole = back.share is not None and back.gap > 0 and back.share >= CANCELLED
-    return "cancelled" if whole else "helped"
+    return "cancelled" if back is not None and back[0] >= CANCELLED else "helped"
 
 
 def table(returns: Returns, groups: Iterable[tuple[str, Sequence[Cell]]]) -> str:
     """One line for each group of cells."""
     lines = []
     for words, cells in groups:
-        off = float(np.mean(np.concatenate(together(returns, "off", cells))))
-        line: dict[str, Any] = {"disturbance": words, "off": f"{off:.4g}"}
+        line: dict[str, Any] = {"disturbance": words}
+        for l1 in ("off", *CONTROLLERS):
+            line[l1] = f"{by_reset(returns, l1, cells).mean():.4g}"
+        line["loss"] = f"{lost(returns, cells).mean():.4g}" if cells[0] != NONE else ""
         for l1 in CONTROLLERS:
-            on = float(np.mean(np.concatenate(together(returns, l1, cells))))
-            line[l1] = f"{on:.4g}"
-        loss = regained(returns, "off", cells)
-        line["loss"] = f"{loss.gap:.4g}" if cells[0] != NONE else ""
-        for l1 in CONTROLLERS:
-            back = regained(returns, l1, cells) if cells[0] != NONE else None
-            shown = (
-                back is not None
-                and back.share is not None
-                and back.gap > LEAST * scale(returns, cells)
-            )
-            line[f"{l1} gives back"] = _share(back) if shown and back is not None else ""
+            back = regained(returns, l1, cells)
+            line[f"{l1} gives back"] = _share(*back) if back is not None else ""
         for l1 in ("paper", "robust"):
             line[f"{l1}:"] = verdict(returns, l1, cells)
         lines.append(line)
     return markdown(lines)
 
 
-def _share(found: Recovery) -> str:
-    assert found.share is not None and found.interval is not None
-    return f"{found.share:.2f} [{found.interval.low:.2f}, {found.interval.high:.2f}]"
+def _share(share: float, interval: Interval) -> str:
+    return f"{share:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
 
 
 def groups_of(returns: Returns) -> dict[str, list[Cell]]:
@@ -181,7 +193,7 @@ def plot(of: dict[str, Returns], file: Path) -> None:
                 color = "white" if abs(shares[row, column]) > 0.3 else "black"
                 ax.text(column, row, mark, ha="center", va="center", color=color, weight="bold")
         norm = TwoSlopeNorm(0, -0.5, 0.5)
-        image = ax.imshow(np.clip(shares, -0.5, 0.5), cmap="RdBu", norm=norm, aspect="auto")
+        image = ax.imshow(shares, cmap="RdBu", norm=norm, aspect="auto")
         ax.set_title(f"L1 {l1}")
         tasks = [task.replace("_", " ") for task in of]
         ax.set_xticks(range(len(of)), tasks, rotation=30, ha="right")
@@ -190,6 +202,7 @@ def plot(of: dict[str, Returns], file: Path) -> None:
     figure.colorbar(
         image,
         ax=axes,
+        extend="both",
         label="change of the return, as a share of the undisturbed one or of the loss",
         shrink=0.7,
     )

@@ -9,7 +9,7 @@ import wandb
 
 from torchrl_l1.cli import main, robustify
 from torchrl_l1.deployment import robustification
-from torchrl_l1.envs import suite
+from torchrl_l1.envs import get_task, suite
 from torchrl_l1.experiment.evaluate import TrainedRun
 from torchrl_l1.experiment.settings import METRPORecipe
 from torchrl_l1.experiment.tracking import Evaluated
@@ -57,7 +57,9 @@ def test_from_a_policy_to_a_controller_that_python_loads(policy_file, tmp_path, 
     assert names["data"]["next", "l1", "u_exec"].shape == (1, 7, 1)
 
     main(["export", str(output), "policy.pt", "--steps", "10", "--trust"])
-    assert "Largest difference in 10 steps" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "Largest difference in 10 steps" in printed
+    assert f"Step:    {get_task('inverted_pendulum').dt} s, preset robust\n" in printed
     assert (tmp_path / "policy.pt").exists()
 
     # Again: it is the same policy. That of another does not take its place.

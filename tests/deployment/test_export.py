@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import warnings
 
 import numpy as np
@@ -20,7 +21,6 @@ from torchrl.envs import (
 from torchrl.modules import IndependentNormal, ProbabilisticActor, TruncatedNormal
 
 from torchrl_l1.deployment import RobustController, export
-from torchrl_l1.deployment.export import cholesky, cholesky_solve, solve_triangular
 from torchrl_l1.deployment.policies import load_policy
 from torchrl_l1.envs import environment_source
 
@@ -66,6 +66,29 @@ def test_onnx_acts_as_the_original(robust, tmp_path):
         pytest.importorskip(name)
     found = export(robust, tmp_path / "policy.onnx", steps=20)
     assert found.error < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("suffix", "preset"), [(".pt", None), (".pt2", "paper"), (".onnx", "paper")]
+)
+def test_the_time_of_a_step_and_what_acts_are_told_and_written(robust, tmp_path, suffix, preset):
+    if suffix == ".onnx":
+        onnx = pytest.importorskip("onnx")
+        pytest.importorskip("onnxscript")
+        pytest.importorskip("onnxruntime")
+    file = tmp_path / f"policy{suffix}"
+    found = export(robust, file, preset=preset, steps=3)
+    # The step is that of Gymnasium's pendulum.
+    assert (found.dt, found.preset) == (0.04, preset or robust.preset)
+    written = {"dt": "", "preset": ""}
+    if suffix == ".pt":
+        torch.jit.load(str(file), _extra_files=written)
+        written = {key: value.decode() for key, value in written.items()}
+    elif suffix == ".pt2":
+        torch.export.load(str(file), extra_files=written)
+    else:
+        written = {one.key: one.value for one in onnx.load(str(file)).metadata_props}
+    assert float(written["dt"]) == 0.04 and written["preset"] == found.preset
 
 
 @pytest.mark.filterwarnings("default")
@@ -172,6 +195,25 @@ def test_scripts_and_checks_of_distributions_are_written(robust, tmp_path):
         assert found.error < 1e-5
 
 
+@pytest.mark.parametrize("suffix", [".pt2", ".onnx"])
+def test_scripts_go_to_torchscript_only(robust, tmp_path, suffix):
+    if suffix == ".onnx":
+        for name in ("onnx", "onnxscript", "onnxruntime"):
+            pytest.importorskip(name)
+    torch.jit.save(torch.jit.script(Decides()), str(tmp_path / "script.pt"))
+    acting = with_policy(robust, f"torchscript:{tmp_path / 'script.pt'}")
+    with pytest.raises(ValueError, match=r"cannot be written as .*: try \.pt, or export L1 alone"):
+        export(acting, tmp_path / f"policy{suffix}", steps=3)
+
+
+def test_what_cannot_be_copied_is_refused_in_a_line(robust, tmp_path):
+    """As a session of a network, or of ONNX."""
+    policy = torch.nn.Linear(4, 1)
+    policy.lock = threading.Lock()
+    with pytest.raises(ValueError, match=r"torchscript \(cannot pickle .*\): export L1 alone"):
+        export(with_policy(robust, policy), tmp_path / "policy.pt", steps=3)
+
+
 class Checks(torch.nn.Module):
     """Decides by what it holds itself, and refuses what is no observation."""
 
@@ -217,19 +259,3 @@ def test_sampling_policies_export_their_mean(robust, tmp_path):
     )  # fmt: skip
     found = export(with_policy(robust, actor), tmp_path / "policy.pt", steps=10)
     assert found.error < 1e-5
-
-
-@pytest.mark.parametrize("size", [1, 3, 6])
-def test_unrolled_algebra_is_that_of_torch(size):
-    torch.manual_seed(size)
-    root = torch.randn(2, size, size, dtype=torch.float64)
-    matrix = root @ root.mT + torch.eye(size)
-    right = torch.randn(2, size, 2, dtype=torch.float64)
-    factor, info = cholesky(matrix)
-    torch.testing.assert_close(factor, torch.linalg.cholesky(matrix))
-    assert not info.any() and cholesky(-matrix)[1].all()
-    for upper in (False, True):
-        triangle = factor.mT if upper else factor
-        expected = torch.linalg.solve_triangular(triangle, right, upper=upper)
-        torch.testing.assert_close(solve_triangular(triangle, right, upper=upper), expected)
-    torch.testing.assert_close(cholesky_solve(right, factor), torch.linalg.solve(matrix, right))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import sys
 import warnings
 from types import SimpleNamespace
 
@@ -196,6 +197,39 @@ def test_statistics_of_vecnormalize_need_a_word(env, tmp_path):
     expected = torch.as_tensor(model.predict(scaled, deterministic=True)[0])
     torch.testing.assert_close(found, expected)
     assert not torch.allclose(found, raw)
+
+
+@pytest.mark.parametrize(
+    "statistics",
+    [
+        "vecnormalize.pkl",
+        "vec_normalize.pkl",
+        "VecNormalize-best.pkl",
+        "rl_model_vecnormalize_64_steps.pkl",
+        "rl_model_64_steps/vecnormalize.pkl",
+    ],
+)
+def test_statistics_are_found_by_all_their_usual_names(env, tmp_path, monkeypatch, statistics):
+    """Of Stable-Baselines3's callback, its Zoo and the hub; nothing is read before."""
+    monkeypatch.setitem(sys.modules, "stable_baselines3", SimpleNamespace())
+    model = tmp_path / "rl_model_64_steps.zip"
+    model.touch()
+    (tmp_path / "replay_buffer.pkl").touch()
+    with pytest.raises(ValueError, match="cannot be read as sb3"):
+        load_policy(f"sb3:{model}", env)
+    (tmp_path / statistics).parent.mkdir(exist_ok=True)
+    (tmp_path / statistics).touch()
+    with pytest.raises(ValueError, match=rf"{statistics} stands beside .*, or say 'none'"):
+        load_policy(f"sb3:{model}", env)
+
+
+def test_of_several_statistics_those_of_the_model_s_steps_are_named(env, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "stable_baselines3", SimpleNamespace())
+    for steps in (8, 64, 128):
+        (tmp_path / f"rl_model_{steps}_steps.zip").touch()
+        (tmp_path / f"rl_model_vecnormalize_{steps}_steps.pkl").touch()
+    with pytest.raises(ValueError, match=r"vecnormalize_64_steps\.pkl stands beside"):
+        load_policy(f"sb3:{tmp_path / 'rl_model_64_steps.zip'}", env)
 
 
 @pytest.mark.parametrize(

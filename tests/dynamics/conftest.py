@@ -1,7 +1,11 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 from tensordict import TensorDict
+
+KEYS = {"observation": ["angle", "rate"], "action": ["torque"]}
 
 
 def transitions(count: int, noise: float = 0.0) -> TensorDict:
@@ -21,3 +25,9 @@ def transitions(count: int, noise: float = 0.0) -> TensorDict:
         },
         batch_size=[count],
     )
+
+
+def write(file: Path, *lines: str) -> Path:
+    """A file of lines."""
+    file.write_text("\n".join(lines), encoding="utf-8")
+    return file

@@ -12,12 +12,7 @@ from tensordict import TensorDict
 
 from torchrl_l1.dynamics import read_csv, read_minari, read_npz, read_transitions
 
-KEYS = {"observation": ["angle", "rate"], "action": ["torque"]}
-
-
-def write(file: Path, *lines: str) -> Path:
-    file.write_text("\n".join(lines), encoding="utf-8")
-    return file
+from .conftest import KEYS, write
 
 
 def table(file: Path, lengths: list[int], dt: float = 0.01, jitter: float = 0.0) -> np.ndarray:
@@ -58,8 +53,8 @@ def test_a_time_that_goes_back_begins_an_episode(tmp_path: Path) -> None:
     table(tmp_path / "log.csv", [5, 4])
     data = read_csv(tmp_path / "log.csv", **KEYS, time="time")
     assert data.shape == (7,) and data["next", "done"].sum() == 2
-    # Without it the two runs are taken for one.
-    assert read_csv(tmp_path / "log.csv", **KEYS).shape == (8,)
+    with pytest.raises(ValueError, match="tells by 'time' of 1 episodes"):  # where it is not named
+        read_csv(tmp_path / "log.csv", **KEYS)
 
 
 def test_a_gap_is_told_and_not_bridged(tmp_path: Path) -> None:
@@ -189,72 +184,6 @@ def test_other_encodings_are_named(tmp_path: Path) -> None:
     file.write_bytes("angle,rate,torque,°C\n0,0,0,20\n".encode("cp1252"))
     with pytest.raises(ValueError, match=r"log\.csv is no text in UTF-8 .*: save it as such"):
         read_csv(file, **KEYS)
-
-
-@pytest.mark.parametrize("name", ["done", "Terminals", "timeouts", "truncations", "is_terminal"])
-def test_ends_of_episodes_are_not_passed_over(tmp_path: Path, name: str) -> None:
-    """Read as one episode, the step from its end to the next start would be the plant's."""
-    ends = np.array([0, 0, 1, 0, 0, 1])
-    columns = {"angle": [0.0, 1, 2, 9, 8, 7], "rate": np.ones(6), "torque": np.ones(6)}
-    rows = [",".join(map(str, row)) for row in zip(*columns.values(), ends, strict=True)]
-    table = write(tmp_path / "log.csv", f"angle,rate,torque,{name}", *rows)
-    np.savez(
-        tmp_path / "log.npz", **columns, **{name: ends.astype(bool)}, number=ends.cumsum() - ends
-    )
-    message = rf"tells by '{name}' of 1 episodes that end before the last row"
-    for read, file in ((read_csv, table), (read_npz, tmp_path / "log.npz")):
-        with pytest.raises(ValueError, match=message):
-            read(file, **KEYS)
-    assert len(read_npz(tmp_path / "log.npz", **KEYS, episode="number")) == 4
-    # One that only says that the log ends is no hindrance.
-    rows[2] = rows[2][:-1] + "False"
-    assert len(read_csv(write(table, f"angle,rate,torque,{name}", *rows), **KEYS)) == 5
-
-
-@pytest.mark.parametrize("options", [{"time": "t"}, {"episode": "day"}, {"episode": "late"}])
-def test_ends_within_an_episode_are_not_passed_over(
-    tmp_path: Path, options: dict[str, str]
-) -> None:
-    """Time that goes on over resets, a number of something else, a count that is one row late."""
-    ends = np.array([0, 0, 1, 0, 0, 1])
-    columns = {"angle": [0.0, 1, 2, 9, 8, 7], "rate": np.ones(6), "torque": np.ones(6)}
-    columns |= {"t": np.arange(6), "day": np.zeros(6), "late": ends.cumsum(), "done": ends}
-    rows = [",".join(map(str, row)) for row in zip(*columns.values(), strict=True)]
-    table = write(tmp_path / "log.csv", ",".join(columns), *rows)
-    np.savez(tmp_path / "log.npz", **columns)
-    for read, file in ((read_csv, table), (read_npz, tmp_path / "log.npz")):
-        with pytest.raises(ValueError, match="tells by 'done' of 1 ends within"):
-            read(file, **KEYS, **options)
-
-
-def test_an_end_may_have_its_last_observation_behind_it(tmp_path: Path) -> None:
-    lines = [f"{x},0,1,{run},{end}" for run in "ab" for x, end in ((0, 0), (1, 1), (2, 0))]
-    file = write(tmp_path / "log.csv", "angle,rate,torque,run,terminated", *lines)
-    data = read_csv(file, **KEYS, episode="run")
-    assert data["next", "observation"][:, 0].tolist() == [1, 2, 1, 2]
-
-
-@pytest.mark.parametrize("no", ["0", "0.00", "0.000000000000000000e+00", "F", "None", "nan"])
-def test_flags_that_are_not_set_are_none_however_they_are_written(tmp_path: Path, no: str) -> None:
-    """As ``numpy.savetxt`` writes nought, among others."""
-    lines = [f"{x},0,1,{run},{no}" for run in "ab" for x in range(4)]
-    file = write(tmp_path / "log.csv", "angle,rate,torque,run,done", *lines)
-    assert len(read_csv(file, **KEYS, episode="run")) == 6
-
-
-def test_arrays_of_flags_may_lie_on_their_side_and_have_the_name_of_a_measurement(
-    tmp_path: Path,
-) -> None:
-    ends = np.array([0, 0, 1, 0, 0, 1])
-    columns = {"angle": np.arange(6.0), "torque": np.ones(6), "run": ends.cumsum() - ends}
-    file = tmp_path / "log.npz"
-    np.savez(file, **columns, terminal=np.ones(6), done=ends[None])
-    keys = {"observation": ["angle", "terminal"], "action": "torque"}
-    assert len(read_npz(file, **keys, episode="run")) == 4
-    with pytest.raises(ValueError, match="tells by 'done' of 1 episodes that end before the last"):
-        read_npz(file, **keys)
-    np.savez(file, **columns, done=np.where(ends == 1, 1.0, np.nan))
-    assert len(read_npz(file, observation="angle", action="torque", episode="run")) == 4
 
 
 def test_names_of_episodes_that_come_back_begin_new_ones(tmp_path: Path) -> None:

@@ -1,9 +1,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import CEMPlanner
@@ -94,6 +96,29 @@ def test_model_as_environment() -> None:
     assert rollout.shape == (4, 3)
     assert rollout["next", "terminated"][:, -1].all()
     torch.testing.assert_close(rollout["next", "reward"][0, :2, 0], torch.tensor([110.0, 211.0]))
+
+
+def test_the_environment_ends_where_the_task_does_and_is_cut_off_where_the_model_does() -> None:
+    def rollout(**settings: Any) -> TensorDict:
+        start = torch.tensor([[0.0, 0.0], [1.0, 0.0]])
+        env = EnsembleModelEnv(
+            drifting_model(2.5), reward, lambda count: start, -1.0, 1.0, (2,), **settings
+        )
+        check_env_specs(env)
+        ones = torch.ones(2, 1)
+        data = env.rollout(9, lambda td: td.set("action", ones), break_when_any_done=False)
+        return data["next"].select("done", "terminated", "truncated")[:, :3]
+
+    ends = rollout(box_exit="truncate")
+    assert ends["truncated"][..., 0].int().tolist() == [[0, 0, 1], [0, 1, 0]]
+    assert not ends["terminated"].any() and torch.equal(ends["done"], ends["truncated"])
+    ends = rollout()
+    assert torch.equal(ends["done"], ends["terminated"]) and ends["done"].any()
+    ends = rollout(terminated=lambda successor: successor[..., 0] > 1.5, box_exit="truncate")
+    assert ends["terminated"][..., 0].int().tolist() == [[0, 1, 0], [1, 1, 1]]
+    assert not ends["truncated"].any()
+    with pytest.raises(ValueError, match="box_exit must be 'fail' or 'truncate'"):
+        rollout(box_exit="stop")
 
 
 def test_specs_are_of_the_model_s_type() -> None:
@@ -288,6 +313,37 @@ def test_what_is_no_number_per_row_is_named() -> None:
         go(start=start[0])
     with pytest.raises(ValueError, match="horizon must be at least 1"):
         go(horizon=0)
+
+
+def test_actions_and_bounds_that_do_not_fit_are_named() -> None:
+    model, start = EnsembleDynamics(2, 3, members=2, hidden=(4,)), torch.zeros(3, 2)
+    low, high = -torch.ones(3), torch.ones(3)
+    for wrong in (torch.zeros(3, 1), torch.zeros(3), torch.zeros(1, 3)):
+        with pytest.raises(ValueError, match=r"policy must give actions \(3, 3\) for .*, got"):
+            imagine(model, lambda x, wrong=wrong: wrong, reward, start, 2, low, high)
+    for bounds, message in (
+        ((high, low), "bounds are empty"),
+        ((low, high[:2]), r"high has shape"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            imagine(model, lambda x: torch.zeros(3, 3), reward, start, 2, *bounds)
+    infinite = torch.full((3,), torch.inf)  # which is no clipping
+    found = imagine(model, lambda x: 9 + torch.zeros(3, 3), reward, start, 2, -infinite, infinite)
+    assert found.shape == (3, 2)
+    largest = torch.finfo(torch.float32).max
+    for bounds, message in (
+        ((-1.0, torch.inf), "bounds must be finite"),
+        ((-largest, largest), "bounds must be finite"),
+        ((1.0, -1.0), "bounds are empty"),
+        ((-1.0, torch.ones(2)), "high has shape"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            EnsembleModelEnv(model, reward, lambda n: torch.zeros(n, 2), *bounds)
+    env = EnsembleModelEnv(model, reward, lambda n: torch.zeros(2, n), -1.0, 1.0, (4,))
+    with pytest.raises(
+        ValueError, match=r"start\(4\) must give observations \(4, 2\), got \(2, 4\)"
+    ):
+        env.reset()
 
 
 @pytest.mark.parametrize("value", [torch.nan, -torch.inf])

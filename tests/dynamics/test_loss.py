@@ -8,6 +8,7 @@ from torchrl_l1.dynamics import (
     EnsembleDynamicsLoss,
     Head,
 )
+from torchrl_l1.dynamics.loss import evaluate_members
 
 from .conftest import transitions
 
@@ -79,3 +80,20 @@ def test_loss_keys_can_be_renamed_and_missing_ones_are_named() -> None:
     assert torch.isfinite(loss(data)["loss_dynamics"])
     with pytest.raises(KeyError, match="executed"):
         loss(data.exclude("executed"))
+
+
+def test_data_that_do_not_fit_the_model_are_named() -> None:
+    loss, data = (
+        EnsembleDynamicsLoss(EnsembleDynamics(2, 1, members=3, hidden=(8,))),
+        transitions(8),
+    )
+    narrow = data.clone()
+    narrow["next", "observation"] = narrow["next", "observation"][:, :1]
+    with pytest.raises(ValueError, match=r"'next', 'observation'\) has shape \(8, 1\), 'observ"):
+        loss(narrow)
+    with pytest.raises(ValueError, match=r"'action' is torch.float64, the model torch.float32"):
+        loss(data.clone().set("action", data["action"].double()))
+    with pytest.raises(ValueError, match=r"batch size \(2, 4\) must be of \[B\] .* \[3, B\]"):
+        loss(data.reshape(2, 4))
+    with pytest.raises(ValueError, match="there are no data"):
+        evaluate_members(loss, data[:0])

@@ -172,3 +172,11 @@ def test_a_mask_of_elites_is_no_list_of_them(kind: torch.dtype) -> None:
         with pytest.raises(ValueError, match="must be indices of members"):
             model.set_elites(mask)
     assert model.elites.tolist() == [0, 1]
+
+
+def test_other_processes_see_new_elites() -> None:
+    model = EnsembleDynamics(3, 2, members=3, hidden=(4,))
+    model.set_elites([0, 1])
+    shared = model.elites.share_memory_()
+    model.set_elites([1, 2])
+    assert shared.tolist() == [1, 2] and model.elites.is_shared()

@@ -125,3 +125,12 @@ def test_the_page_names_them_all():
         row = next(line for line in page.splitlines() if line.startswith(f"| `{entry.name}` "))
         assert f"`{entry.setting}`" in row and entry.acts_on in row
         assert ("| yes |" in row) == entry.matched
+
+
+def test_delays_that_are_drawn_are_whole_numbers_alike():
+    torch.manual_seed(0)
+    env = make_env("hopper", 300, delay=Uniform(0, 3, shared=True), seed=0)
+    env.reset()
+    counts = env.transform[0]._state["value"].flatten().long().bincount()
+    assert counts.shape == (3,) and counts.min() > 70
+    assert env.rollout(3).shape == (300, 3)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from torchrl.envs import (
 
 from torchrl_l1.control import time_step
 from torchrl_l1.envs import (
+    BatchedMujocoEnv,
     ExternalTask,
     Task,
     Uniform,
@@ -187,22 +190,6 @@ def test_a_reward_that_single_precision_cannot_hold_is_not_finite():
     assert data["next", "reward"][..., 0].tolist() == [[1.0, 0.0]] * 2
 
 
-def test_a_restart_by_mujoco_is_no_transition(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # where MuJoCo logs what it warns of
-    env = get_task("gymnasium/InvertedPendulum-v5").environment(2, seed=0)
-    data = env.reset()
-    for spoilt in (["qvel"], ["qvel"], ["qpos", "qvel"], []):
-        before = data["observation"]
-        simulated = env.members[1].simulation().data
-        for part in spoilt:  # MuJoCo restarts from the pose of the XML, as often as it takes
-            getattr(simulated, part)[:] = np.nan
-        data = env.step(data.set("action", torch.ones(2, 1)))["next"]
-        assert data["non_finite"][:, 0].tolist() == [False, bool(spoilt)]
-        assert torch.equal(data["observation"][1], before[1]) == bool(spoilt)
-        assert not torch.equal(data["observation"][0], before[0])
-        assert np.isfinite(simulated.qpos).all()
-
-
 def test_actions_beyond_the_bounds_are_clipped():
     env = task_of(Cart).environment(1, seed=0)  # the cart itself takes no others
     state = env.reset()
@@ -251,7 +238,7 @@ def test_what_an_environment_does_not_tell_is_asked_for():
     assert get_task("gymnasium/MountainCarContinuous-v0", dt=1.0).dt == 1.0
     with pytest.raises(ValueError, match=r"give horizon=STEPS"):
         ExternalTask(environment_source(Cart))
-    with pytest.raises(ValueError, match=r"takes 0.05 s, not 0.1"):
+    with pytest.raises(ValueError, match=r"takes 0.05 s, not 0.1: leave dt out, or correct"):
         get_task("gymnasium/Pendulum-v1", dt=0.1)
     with pytest.raises(ValueError, match="leave dt out"):
         get_task("half_cheetah", dt=1.0)
@@ -264,6 +251,9 @@ def test_of_several_time_limits_the_shortest_counts():
             return TimeLimit(TimeLimit(Cart(), limits[0]), limits[1])
 
         assert ExternalTask(environment_source(make)).horizon == 200
+        assert task_of(make, horizon=100).horizon == 100
+        with pytest.raises(ValueError, match="ends after 200 steps, not 250: leave horizon out"):
+            task_of(make, horizon=250)
 
 
 def test_own_tasks_stay_what_they_are():
@@ -302,8 +292,9 @@ def test_environments_of_torchrl():
 @pytest.mark.parametrize(("ends", "late"), [(3, False), (9, True)])
 def test_episodes_of_torchrl_end_as_they_say(ends, late):
     # With a step counter it is TorchRL that steps it.
-    task = task_of(lambda: TransformedEnv(GymWrapper(Cart(ends=ends)), StepCounter(5)), horizon=8)
-    last = task.environment(1, seed=0).rollout(20)["next"][0, -1]
+    limited = lambda: TransformedEnv(GymWrapper(Cart(ends=ends)), StepCounter(5))  # noqa: E731
+    env = task_of(limited, horizon=None).environment(1, seed=0, max_steps=8)
+    last = env.rollout(20)["next"][0, -1]
     assert (bool(last["terminated"]), bool(last["truncated"])) == (not late, late)
 
 
@@ -459,3 +450,47 @@ def test_a_batch_of_one_is_not_asked_for_its_members():
     assert not task.has_plant and task.environment(2, seed=0).rollout(3).shape == (2, 3)
     with pytest.raises(ValueError, match="does not tell how long an episode is"):
         task_of(lambda: SerialEnv(1, lambda: GymWrapper(Cart())), horizon=None, dt=0.1)
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, GymWrapper])
+def test_a_function_that_keeps_its_environment_is_refused(wrap):
+    kept = wrap(Cart())
+    make_two = [task_of(lambda: kept).environment, environment_source(lambda: kept).several]
+    for make in make_two:
+        with pytest.raises(ValueError, match="returns the same environment twice"):
+            make(2)
+
+
+def test_names_of_files_are_those_of_the_folder_and_of_their_text(tmp_path, monkeypatch):
+    text = (
+        Path(__file__)
+        .read_text()
+        .replace("ANY = Box(-np.inf, np.inf, (2,)", "ANY = Box(-9, 9, ({},)")
+    )
+    for folder, width in (("one", 3), ("other", 4)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "cart_of_a_test.py").write_text(text.replace("{}", str(width)))
+    found = []
+    for folder in ("one", "other", "one"):
+        monkeypatch.chdir(tmp_path / folder)
+        found.append(get_task("cart_of_a_test.py:Cart", horizon=5))
+    assert [task.observation_dim for task in found] == [3, 4, 3] and found[0] is found[2]
+    Path("cart_of_a_test.py").write_text(text.replace("{}", "5"))
+    assert get_task("cart_of_a_test.py:Cart", horizon=5).observation_dim == 5
+
+
+def own_tasks() -> BatchedMujocoEnv:
+    return BatchedMujocoEnv("hopper", max_steps=200)
+
+
+def heavy() -> BatchedMujocoEnv:
+    return BatchedMujocoEnv("hopper", plant={"mass": 1.5})
+
+
+def test_what_differs_from_a_task_of_ours_is_kept_or_refused():
+    assert get_task(f"{__file__}:own_tasks").horizon == 200
+    assert get_task(f"{__file__}:own_tasks", horizon=33).horizon == 33
+    with pytest.raises(ValueError, match="another plant"):
+        get_task(f"{__file__}:heavy")
+    with pytest.raises(ValueError, match="dt: a step of hopper"):
+        get_task(f"{__file__}:own_tasks", dt=0.02)

@@ -12,6 +12,7 @@ from torchrl_l1.envs import (
     BatchedMujocoEnv,
     disturbed_model,
     environment_source,
+    get_task,
     make_env,
     suite,
 )
@@ -103,6 +104,20 @@ def test_errors():
     for argument in ("action_noise", "observation_noise"):
         with pytest.raises(ValueError, match="half_width"):
             make_env("half_cheetah", 2, **{argument: -0.1})
+
+
+def test_settings_of_a_task_go_through():
+    name = "gymnasium/MountainCarContinuous-v0"
+    env = make_env(name, 2, dt=0.5, horizon=7, seed=0)
+    assert env.base_env.task.dt == 0.5 and env.rollout(20).shape == (2, 7)
+    own = get_task("hopper", horizon=50)
+    assert own.horizon == 50 and get_task("hopper", horizon=1000) is get_task("hopper")
+    assert get_task(own, horizon=30).horizon == 30
+    for settings in ({"dt": 0.3}, {"observation_keys": ["x"]}):
+        with pytest.raises(ValueError, match=next(iter(settings))):
+            get_task(own, **settings)
+    with pytest.raises(ValueError, match=r"horizon .* go with a name"):
+        get_task(env.base_env.task, horizon=5)
 
 
 @pytest.mark.filterwarnings("ignore:.* does nothing here")

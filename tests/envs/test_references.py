@@ -65,3 +65,19 @@ def test_folders_are_those_that_hold_what_is_named(tmp_path: Path) -> None:
     assert folders_of(names, [one, other, tmp_path]) == [str(one), str(other)]
     assert folders_of(["gymnasium/package:Env-v0"], [other]) == [str(other)]
     assert folders_of(["gymnasium/Reacher-v5", "builtin"], [one, other]) == []
+
+
+@pytest.mark.parametrize("line", ["import a_module_that_is_missing", "1 / 0", "def broken(:"])
+def test_a_file_that_fails_is_named_and_leaves_nothing_behind(line: str, tmp_path: Path) -> None:
+    file = tmp_path / "half_loaded.py"
+    file.write_text(f"x = 1\n{line}\n")
+    with pytest.raises(ValueError, match=r"half_loaded.py cannot be imported \(\w+: ") as caught:
+        load_attribute(f"{file}:x")
+    assert "\n" not in str(caught.value) and "half_loaded" not in sys.modules
+
+
+def test_a_module_that_fails_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "a_failing_module.py").write_text("1 / 0\n")
+    with pytest.raises(ValueError, match=r"a_failing_module cannot be imported \(ZeroDivision"):
+        load_attribute("a_failing_module:x")

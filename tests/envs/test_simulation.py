@@ -17,7 +17,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
 
-from torchrl_l1.envs import TASKS, BatchedMujocoEnv, make_env
+from torchrl_l1.envs import TASKS, BatchedMujocoEnv, get_task, make_env
 
 GYM_IDS = {
     "inverted_pendulum": "InvertedPendulum-v5",
@@ -385,3 +385,19 @@ def test_what_a_task_makes_of_a_state_must_be_finite_too(where, bad):
     assert following["reward"].isfinite().all()
     steps.clear()
     assert not _step(env, torch.ones(2, 6))["non_finite"].any()
+
+
+def test_a_restart_by_mujoco_is_no_transition(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where MuJoCo logs what it warns of
+    env = get_task("gymnasium/InvertedPendulum-v5").environment(2, seed=0)
+    data = env.reset()
+    for spoilt in (["qvel"], ["qvel"], ["qpos", "qvel"], []):
+        before = data["observation"]
+        simulated = env.members[1].simulation().data
+        for part in spoilt:  # MuJoCo restarts from the pose of the XML, as often as it takes
+            getattr(simulated, part)[:] = np.nan
+        data = env.step(data.set("action", torch.ones(2, 1)))["next"]
+        assert data["non_finite"][:, 0].tolist() == [False, bool(spoilt)]
+        assert torch.equal(data["observation"][1], before[1]) == bool(spoilt)
+        assert not torch.equal(data["observation"][0], before[0])
+        assert np.isfinite(simulated.qpos).all()

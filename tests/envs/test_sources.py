@@ -5,11 +5,18 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import FrameSkipTransform, GymEnv, GymWrapper, PendulumEnv, TransformedEnv
+from torchrl.envs import (
+    FrameSkipTransform,
+    GymEnv,
+    GymWrapper,
+    PendulumEnv,
+    RewardSum,
+    TransformedEnv,
+)
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_l1.deployment import environment_source, time_step, vector_environment
-from torchrl_l1.envs import TASKS, make_env
+from torchrl_l1.envs import TASKS, ExternalTask, make_env
 from torchrl_l1.envs.sources import simulation_of
 
 ONE = torch.ones(1)
@@ -187,3 +194,51 @@ def test_spaces_that_torchrl_cannot_wrap_are_named():
 
     with pytest.raises(ValueError, match=r"returns a Mixed, which TorchRL cannot .* Tuple\(Box"):
         environment_source(Mixed).one()
+
+
+class Written(gymnasium.Env):
+    """Writes every observation to the same array; pushes what it is given."""
+
+    action_space = gymnasium.spaces.Box(-1, 1, (1,))
+    observation_space = gymnasium.spaces.Box(-9, 9, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        self.place = np.zeros(1, np.float32)
+        return self.place, {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        self.place += action
+        return self.place, 0.0, False, False, {}
+
+
+def test_observations_do_not_change_after_they_are_read():
+    env = environment_source(Written).single()
+    data = env.rollout(4, lambda td: td.set("action", ONE))
+    assert data["observation"].flatten().tolist() == [0, 1, 2, 3]
+    assert data["next", "observation"].flatten().tolist() == [1, 2, 3, 4]
+
+
+def test_disturbed_actions_are_clipped_as_those_of_tasks_are():
+    source = environment_source(Written)
+    task = ExternalTask(source, dt=0.1, horizon=5)
+    for env in (make_env(task, 2, bias=0.5), source.several(2, {"bias": 0.5})):
+        after = env.step(env.reset().set("action", torch.tensor([[0.25], [1.0]])))["next"]
+        assert after["observation"].flatten().tolist() == [0.75, 1.0]
+    own = environment_source("half_cheetah").several(1)
+    assert [type(transform).__name__ for transform in own.transform] == []
+
+
+def test_rewards_that_are_summed_up_are_no_part_of_the_state():
+    env = vector_environment(TransformedEnv(PendulumEnv(), RewardSum()))
+    assert env.observation_spec["observation"].shape == (2,)
+
+
+def test_parts_that_would_be_left_out_of_the_state_are_named():
+    class Gripping(InParts):
+        observation_space = gymnasium.spaces.Dict(
+            **InParts.observation_space.spaces, gripper=gymnasium.spaces.Discrete(2)
+        )
+
+    with pytest.raises(ValueError, match=r"gripper are no .*observation_keys=\[height,velocity\]"):
+        environment_source(Gripping).one()

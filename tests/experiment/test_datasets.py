@@ -1,9 +1,8 @@
 from __future__ import annotations
 
 import csv
-import errno
 import json
-import os
+import math
 import pickle
 import shlex
 from collections.abc import Callable
@@ -17,23 +16,21 @@ import torch
 from omegaconf import DictConfig
 from safetensors.torch import save_file
 from tensordict import TensorDict, lazy_stack
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_l1.algorithms import DatasetColumns
 from torchrl_l1.cli import main
 from torchrl_l1.dynamics import read_transitions
 from torchrl_l1.envs import BatchedMujocoEnv, get_task
-from torchrl_l1.experiment.datasets import (
-    Episode,
-    check_output,
-    read_dataset,
-    split_episodes,
-    write_dataset,
-)
+from torchrl_l1.experiment.datasets import read_dataset
+from torchrl_l1.experiment.episodes import Episode, split_episodes, write_dataset
 from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recording import MEDIUM, NoisyPolicy, record
 from torchrl_l1.experiment.run import run
+
+pytestmark = pytest.mark.usefixtures("own_folder")
 
 QUIET = pytest.mark.filterwarnings("ignore::UserWarning:minari", "ignore::DeprecationWarning")
 
@@ -43,84 +40,6 @@ TINY = [
     *("policy.hidden=[8]", "fit.batch_size=16", "fit.max_epochs=2", "cloning.max_epochs=2"),
     *("wandb.mode=disabled", "trpo.fisher_fraction=1.0"),
 ]
-
-
-@pytest.fixture(autouse=True)
-def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-
-
-@pytest.fixture
-def episodes() -> list[Episode]:
-    torch.manual_seed(0)
-    env = BatchedMujocoEnv("inverted_pendulum", 3, max_steps=20, seed=0)
-    return split_episodes(env.rollout(50, break_when_any_done=False))
-
-
-def joined(episodes: list[Episode]) -> dict[str, np.ndarray]:
-    return {
-        "observation": np.concatenate([e.observations[:-1] for e in episodes]),
-        "action": np.concatenate([e.actions for e in episodes]),
-        "next": np.concatenate([e.observations[1:] for e in episodes]),
-    }
-
-
-def test_episodes_are_those_of_the_environments() -> None:
-    torch.manual_seed(0)
-    data = BatchedMujocoEnv("walker", 2, max_steps=30, seed=0).rollout(
-        50, break_when_any_done=False
-    )
-    found = split_episodes(data)
-    assert sum(map(len, found)) == 100
-    done = data["next", "done"].sum() + (~data["next", "done"][:, -1]).sum()
-    assert len(found) == int(done) > 3
-    rewards = np.concatenate([episode.rewards for episode in found])
-    assert np.array_equal(rewards, data["next", "reward"].flatten().numpy())
-    for episode in found:
-        ends = episode.terminations | episode.truncations
-        assert ends[-1] and not ends[:-1].any()
-        assert episode.observations.dtype == np.float32
-    assert any(episode.terminations[-1] for episode in found)
-
-
-def test_a_step_that_did_not_happen_is_left_out() -> None:
-    torch.manual_seed(0)
-    data = BatchedMujocoEnv("inverted_pendulum", 1, max_steps=8, seed=0).rollout(8)
-    data["next", "non_finite"][0, -1] = True
-    (episode,) = split_episodes(data)
-    assert len(episode) == 7 and episode.truncations[-1]
-    assert np.array_equal(episode.observations[-1], data["observation"][0, 7].numpy())
-
-
-@QUIET
-@pytest.mark.parametrize("output", ["deep/data.npz", "folder", "pendulum/random-v0"])
-def test_what_is_written_is_read_again(output: str, episodes: list[Episode]) -> None:
-    if output.endswith("-v0"):
-        pytest.importorskip("minari")
-        pytest.importorskip("h5py")
-    task = get_task("inverted_pendulum")
-    assert write_dataset(output, episodes, task, "random") == output
-    data = read_dataset(output)
-    read, expected = read_transitions(data, dtype=torch.float32), joined(episodes)
-    assert read.dropped == 0
-    assert np.array_equal(read.data["observation"], expected["observation"])
-    assert np.array_equal(read.data["action"], expected["action"])
-    assert np.array_equal(read.data["next", "observation"], expected["next"])
-    # Episodes stay apart: 50 steps of 20 are three of them in each environment.
-    assert int((~read.joined).sum()) == len(episodes) == 9
-    with pytest.raises(ValueError, match="already"):
-        write_dataset(output, episodes, task, "random")
-    if not output.endswith(".npz"):
-        terminated = np.concatenate([episode.terminations for episode in episodes])
-        assert np.array_equal(data["next", "terminated"].flatten(), terminated)
-        truncated = np.concatenate([episode.truncations for episode in episodes])
-        assert np.array_equal(data["next", "truncated"].flatten(), truncated)
-        assert data["next", "reward"].dtype in (torch.float32, torch.float64)
-    else:
-        arrays = np.load(output)
-        assert arrays["observation"].dtype == arrays["reward"].dtype == np.float32
-        assert arrays["truncated"].sum() == 9 and not arrays["terminated"].any()
 
 
 @QUIET
@@ -206,6 +125,48 @@ def test_trajectories_of_different_lengths_in_a_folder() -> None:
         read_dataset("ragged")
 
 
+def steps(*shape: int) -> TensorDict:
+    """Transitions of a plant that counts."""
+    x = torch.arange(1.0, 1 + math.prod(shape)).reshape(*shape, 1)
+    after = {"observation": x + 1, "done": torch.zeros_like(x, dtype=torch.bool)}
+    return TensorDict({"observation": x, "action": -x, "next": after}, shape)
+
+
+@pytest.mark.parametrize("storage", [LazyTensorStorage, LazyMemmapStorage])
+def test_of_a_replay_buffer_what_it_holds(storage: type[LazyTensorStorage]) -> None:
+    buffer = TensorDictReplayBuffer(storage=storage(20))
+    buffer.extend(steps(5))
+    buffer.dumps("rb")
+    for source in ("rb", "rb/storage"):
+        found = read_dataset(source)
+        assert found["observation"].flatten().tolist() == [1, 2, 3, 4, 5]
+    buffer.extend(steps(18))  # five there, fifteen behind them, three in place of the first
+    buffer.dumps("rb")
+    found = read_dataset("rb")
+    assert found["observation"].flatten().tolist() == [16, 17, 18, 4, 5, *range(1, 16)]
+    Path("rb/storage/storage_metadata.json").write_text("{")
+    with pytest.raises(ValueError, match="no tensordict that can be read"):
+        read_dataset("rb")
+
+
+@pytest.mark.parametrize("ndim", [1, 2])
+def test_a_replay_buffer_of_batches_must_be_full(ndim: int) -> None:
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20, ndim=ndim))
+    buffer.extend(steps(2, 5))
+    buffer.dumps("rb")
+    with pytest.raises(ValueError, match=r"buffer of batches.*buffer\[:\]\.memmap\(folder\)"):
+        read_dataset("rb")
+    buffer[:].memmap("all")
+    assert read_dataset("all").shape == (2, 5)
+
+
+def test_the_empty_rest_of_a_buffer_s_own_folder_is_told() -> None:
+    buffer = TensorDictReplayBuffer(storage=LazyMemmapStorage(20, scratch_dir="scratch"))
+    buffer.extend(steps(5))
+    with pytest.warns(UserWarning, match=r"last 15 of 20 rows .* are zeros.*buffer\.dumps"):
+        assert read_dataset("scratch").shape == (20,)
+
+
 def test_a_table_needs_names() -> None:
     Path("drive.csv").write_text("t,a,b,u\n0,0,0,1\n0.1,1,0,1\n0.2,2,1,0\n")
     with pytest.raises(ValueError, match="say which columns are what"):
@@ -216,6 +177,11 @@ def test_a_table_needs_names() -> None:
         text = Path("drive.csv").read_text().replace(",", mark)
         Path("other.csv").write_text("\n" + text)
         assert (read_dataset("other.csv", columns) == read_dataset("drive.csv", columns)).all()
+    for header in ("x,u,episode", ' "episode" , "x","u"'):  # as an array of this name in .npz files
+        cells = [(x, 0, x // 3) if header[0] == "x" else (x // 3, x, 0) for x in range(6)]
+        Path("runs.csv").write_text("\n".join([header, *(f"{a},{b},{c}" for a, b, c in cells)]))
+        data = read_dataset("runs.csv", DatasetColumns(["x"], ["u"]))
+        assert data["observation"].flatten().tolist() == [0, 1, 3, 4]
     arrays = {"x": np.arange(6.0), "u": np.zeros(6), "run": np.array([0, 0, 0, 1, 1, 1])}
     np.savez("drive.npz", **arrays)
     data = read_dataset("drive.npz", DatasetColumns(["x"], ["u"], episode="run"))
@@ -278,10 +244,6 @@ def test_names_of_minari_s_need_minari(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "minari", None)
     with pytest.raises(ValueError, match=r"torchrl-l1\[minari\]"):
         read_dataset("hopper/medium-v0")
-    with pytest.raises(ValueError, match=r"torchrl-l1\[minari\]'?, or choose a .npz file"):
-        check_output("hopper/medium-v0")
-    with pytest.raises(ValueError, match=r"datasets are \.npz files"):
-        check_output("data.h5")
 
 
 def test_noise_is_added_and_clipped() -> None:
@@ -433,28 +395,3 @@ def _small() -> dict[str, np.ndarray]:
         ),
         "episode": np.repeat([0, 1], 41),
     }
-
-
-@QUIET
-@pytest.mark.parametrize("output", ["data.npz", "folder", "pendulum/random-v0"])
-def test_what_cannot_be_written_whole_is_not_there(
-    output: str, episodes: list[Episode], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    def torn(*arguments: Any, **options: Any) -> None:
-        raise full
-
-    task = get_task("inverted_pendulum")
-    with monkeypatch.context() as full_disk:
-        if output.endswith("-v0"):
-            minari = pytest.importorskip("minari")
-            pytest.importorskip("h5py")
-            full_disk.setattr(minari.utils, "MinariDataset", torn)  # all is written by then
-        elif output == "folder":
-            full_disk.setattr(torch.Tensor, "copy_", torn)
-        full_disk.setattr(os, "fsync", torn)
-        with pytest.raises(OSError, match="No space left"):
-            write_dataset(output, episodes, task, "random")
-    assert not [file for file in tmp_path.rglob("*") if file.is_file()]
-    assert write_dataset(output, episodes, task, "random") == output

@@ -438,7 +438,7 @@ def test_campaign_over_two_algorithms(tmp_path: Path, start_cli: Callable[..., A
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("cem.elites=9", "must not exceed"),
+        ("cem.elites=9", "must be fewer"),
         ("propagation=ts2", "propagation"),
         ("precision=float16", "precision"),
         ("random_steps=0", "random_steps"),

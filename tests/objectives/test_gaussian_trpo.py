@@ -128,6 +128,25 @@ def test_rejected_and_impossible_steps_leave_the_parameters_alone() -> None:
     assert torch.equal(parameters_to_vector(policy.parameters()), before)
 
 
+def test_shapes_that_do_not_fit_are_named() -> None:
+    torch.manual_seed(0)
+    policy = GaussianPolicy(3, 2, (8,))
+    data = samples(policy, 40)
+    before = parameters_to_vector(policy.parameters()).clone()
+    parts = {"log_std": policy.log_std, "inputs": data["observation"]}
+    parts |= {"action": data["action"], "advantage": data["advantage"]}
+    for name, wrong in (
+        ("action", data["action"][:, :1]),
+        ("advantage", data["advantage"][:1]),
+        ("advantage", data["advantage"][:, 0]),
+        ("inputs", data["observation"][None]),
+        ("log_std", policy.log_std[:1]),
+    ):
+        with pytest.raises(ValueError, match=f"gaussian_trpo_step: {name} has shape .*, expected"):
+            gaussian_trpo_step(policy.mean, config=TRPOConfig(), **{**parts, name: wrong})
+    assert torch.equal(parameters_to_vector(policy.parameters()), before)
+
+
 def test_other_networks_are_refused() -> None:
     linear = nn.Linear(3, 3)
     assert is_tanh_network(nn.Sequential(linear))

@@ -188,7 +188,7 @@ def test_the_scale_of_the_advantages_does_not_matter(closed_form: bool) -> None:
     start = GaussianPolicy(3, 2, (4,), std=0.7).double()
     data = batch(make_actor(start.float())).double()
     steps = []
-    for scale in (1.0, 1e-8, 1e-180):
+    for scale in (1.0, 1e-2, 1e-4, 1e-8, 1e-180):
         policy, own = deepcopy(start).double(), data.clone()
         own["advantage"] *= scale
         if closed_form:
@@ -214,3 +214,31 @@ def test_a_parameter_that_the_distribution_does_not_use_stays_as_it_is() -> None
     for name, parameter in alone.named_parameters():
         torch.testing.assert_close(parameter, beside.get_parameter(name))
     assert torch.equal(parameters_to_vector(beside.value.parameters()), before)
+
+
+def test_samples_in_rows_and_columns_are_those_in_one_row() -> None:
+    torch.manual_seed(0)
+    policy = GaussianPolicy(3, 2, (4,), std=0.7)
+    data = batch(make_actor(policy))
+    data["observation"][100:] *= 0.01  # the first row alone is not like the others
+    with torch.no_grad():
+        data["action"] = policy(data["observation"])[0] + 0.7 * torch.randn(400, 2)
+    other = deepcopy(policy)
+    expected = trpo_step(make_actor(policy), data, TRPOConfig())
+    assert trpo_step(make_actor(other), data.reshape(4, 100), TRPOConfig()) == expected
+    for name, parameter in policy.named_parameters():
+        torch.testing.assert_close(parameter, other.get_parameter(name))
+
+
+def test_a_step_needs_no_gradients_around_it() -> None:
+    torch.manual_seed(0)
+    policy = GaussianPolicy(3, 2, (4,), std=0.7)
+    actor = make_actor(policy)
+    data = batch(actor)
+    with torch.no_grad():
+        assert trpo_step(actor, data, TRPOConfig()).accepted
+    policy.requires_grad_(False)
+    with pytest.raises(ValueError, match="all parameters of the actor are frozen"):
+        trpo_step(actor, data, TRPOConfig())
+    with pytest.raises(KeyError, match=r"TRPO found no 'advantage' in the data, only .*action"):
+        trpo_step(actor, data.exclude("advantage"), TRPOConfig())

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchrl_l1.planning import CEMConfig, TrajectorySampler, plan_cem
-from torchrl_l1.planning.sequences import sample_around
+from torchrl_l1.planning.cem import sample_around
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -84,7 +84,7 @@ def test_costs_within_one_percent_of_the_riccati_solution(linear):
 @given(
     seed=st.integers(0, 10_000),
     share=st.floats(0, 1),
-    elites=st.integers(1, 12),
+    elites=st.integers(1, 11),
     iterations=st.integers(1, 3),
     value=st.sampled_from([math.nan, math.inf, -math.inf]),
     return_best=st.booleans(),
@@ -101,7 +101,7 @@ def test_returns_that_are_not_finite_are_never_chosen(
         return torch.where(bad, value, returns)
 
     start = 0.2 * torch.ones(2, 3, 1)
-    config = CEMConfig(3, 12, elites, iterations, return_best=return_best)
+    config = CEMConfig(3, 12, elites, iterations, minimum_variance=0.0, return_best=return_best)
     result = plan_cem(evaluate, start, -1.0, 1.0, config, noise)
     for field in (result.actions, result.mean, result.variance, result.best):
         assert torch.isfinite(field).all()
@@ -155,11 +155,47 @@ def test_stops_where_the_variance_is_small():
     result = plan_cem(evaluate, torch.zeros(2, 2, 1), -1.0, 1.0, config, generator())
     assert 1 < len(calls) < 50
     assert (result.variance <= 0.01).all()
-    # One that is done keeps its distribution while others go on.
-    alone = CEMConfig(2, 200, 5, 50, initial_variance=1e-4, minimum_variance=0.01)
-    calls.clear()
-    plan_cem(evaluate, torch.zeros(2, 2, 1), -1.0, 1.0, alone, generator())
-    assert len(calls) == 1
+
+
+def test_a_minimum_variance_that_ends_every_plan_at_once_is_named():
+    def plan(reach, **settings):
+        evaluate, config = quadratic(torch.tensor(0.4 * reach)), CEMConfig(2, 200, 5, **settings)
+        return plan_cem(evaluate, torch.zeros(1, 2, 1), -reach, reach, config, generator())
+
+    with pytest.raises(ValueError, match=r"minimum_variance \(0.001\) must be below .* square of"):
+        plan(0.05)
+    scaled = plan(0.05, minimum_variance=0.001 * 0.05**2).mean / 0.05
+    torch.testing.assert_close(scaled, plan(1.0).mean, rtol=0, atol=1e-4)
+    plan(0.05, iterations=1)  # which is all that was asked for
+    with pytest.raises(ValueError, match="minimum_variance"):
+        plan(1.0, initial_variance=1e-4)
+
+
+@pytest.mark.parametrize("return_best", [True, False])
+def test_a_plan_does_not_depend_on_others_of_its_batch(return_best):
+    uniform = torch.rand(20, 60, 3, 1, generator=generator())
+
+    def plan(targets):
+        calls = iter(uniform)
+        config = CEMConfig(
+            3, 60, 6, 20, momentum=0.0, minimum_variance=0.01, return_best=return_best
+        )
+        like = torch.zeros(len(targets), 3, 1)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(torch, "rand", lambda shape, **_: next(calls).expand(shape).clone())
+            evaluate = quadratic(torch.tensor(targets)[:, None, None, None])
+            return plan_cem(evaluate, like, -1.0, 1.0, config).actions[0]
+
+    # The second, whose optimum is at a bound where few sequences are drawn, takes longer.
+    assert torch.equal(plan([0.1]), plan([0.1, 0.9]))
+
+
+def test_the_mean_stays_within_the_bounds():
+    start = torch.full((1, 4, 1), 0.7)
+    config = CEMConfig(4, 20, 5, iterations=7, momentum=0.3, minimum_variance=0.0)
+    for reach in (0.1, 0.3, 0.7):
+        result = plan_cem(lambda u: u.sum((-2, -1)), start, -reach, reach, config, generator())
+        assert (result.actions <= torch.tensor(reach)).all()
 
 
 def test_an_environment_that_is_done_stays_as_it_is_while_others_go_on():
@@ -206,7 +242,7 @@ def test_starts_within_the_bounds():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"candidates": 10, "elites": 11}, r"elites \(11\) must not exceed .*candidates \(10\)"),
+        ({"candidates": 10, "elites": 11}, r"elites \(11\) must be fewer than .*candidates \(10\)"),
         ({"horizon": 0}, "cem.horizon must be at least 1, got 0"),
         ({"candidates": 0}, "candidates must be"),
         ({"elites": 0}, "elites must be"),
@@ -230,7 +266,8 @@ def test_impossible_settings_are_named(wrong, message):
         ({"low": 1.0}, "bounds are empty"),
         ({"low": 2.0}, "bounds are empty"),
         ({"high": math.inf}, "bound high must be finite"),
-        ({"low": math.nan}, "bound low must be finite"),
+        ({"low": math.nan}, "bounds are empty"),
+        ({"high": torch.finfo(torch.float32).max}, "bound high must be finite.* look for actions"),
         ({"low": -torch.ones(3)}, r"bound low has shape \(3,\), expected \(2,\)"),
         ({"high": torch.ones(1, 2)}, "bound high has shape"),
         ({"mean": torch.zeros(1, 3, 2)}, r"mean must have shape \(environments, 4, actions\)"),

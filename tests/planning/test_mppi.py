@@ -69,3 +69,26 @@ def test_returns_that_are_not_finite_weigh_nothing(value):
 def test_impossible_settings_are_named(wrong, message):
     with pytest.raises(ValueError, match=message):
         MPPIConfig(**wrong)
+
+
+def test_leaves_a_bound_where_it_starts():
+    start = torch.ones(1, 1, 1)
+    config = MPPIConfig(1, 400, temperature=0.05)
+    result = plan_mppi(
+        lambda u: -(u + 0.5).square().sum((-2, -1)), start, -1.0, 1.0, config, generator()
+    )
+    assert result.mean.item() < 0
+
+
+def test_draws_normal_sequences_clipped_to_the_bounds():
+    drawn = []
+
+    def evaluate(u):
+        drawn.append(u)
+        return torch.zeros(u.shape[:2])
+
+    plan_mppi(evaluate, torch.zeros(1, 1, 1), -1.0, 1.0, MPPIConfig(1, 20_000), generator())
+    u = drawn[0].flatten()
+    # A quarter of the range is half of the way to a bound, beyond which 2.275 % lie on each side.
+    assert (u == 1).double().mean().item() == pytest.approx(0.02275, abs=0.004)
+    assert (u.abs() < 0.5).double().mean().item() == pytest.approx(0.6827, abs=0.012)

@@ -323,12 +323,29 @@ def test_plans_of_bad_observations():
         controller.plan(torch.zeros(3, 4))
 
 
+def test_a_reward_that_is_no_number_where_something_moves_is_named():
+    controller = make_controller()
+    controller.sampler = TrajectorySampler(
+        controller.sampler.dynamics,
+        lambda x, u, successor: torch.where((successor == x).all(-1), 0.0, torch.nan),
+    )
+    with pytest.raises(ValueError, match=r"gives nan at the observation .* and the next"):
+        controller.plan(torch.ones(3, 4))
+
+
+def test_a_start_that_is_no_number_is_named():
+    with pytest.raises(ValueError, match="start must be finite"):
+        make_controller().plan(torch.zeros(3, 4), torch.full((3, 4, 1), torch.nan))
+
+
 def test_bad_settings_are_named():
     for wrong, message in (
         ({"low": 3.0}, "bounds are empty"),
         ({"high": [1.0, 2.0]}, r"bound high has shape \(2,\), expected \(1,\)"),
-        ({"replan_every": 0}, "replan_every must be between 1 and the horizon 4, got 0"),
-        ({"replan_every": 5}, "replan_every must be"),
+        ({"replan_every": 0}, "replan_every must be at least 1, got 0"),
+        ({"replan_every": 1.5}, "replan_every must be an integer, got 1.5"),
+        ({"high": torch.finfo(torch.float32).max}, "bound high must be finite"),
+        ({"replan_every": 5}, "replan_every must be between 1 and the horizon 4, got 5"),
     ):
         with pytest.raises(ValueError, match=message):
             make_controller(**wrong)

@@ -152,3 +152,9 @@ def test_best_of_a_quadratic_is_distributed_as_it_must_be(horizon, share):
 def test_impossible_settings_are_named():
     with pytest.raises(ValueError, match=r"shooting.candidates must be at least 1, got 0"):
         ShootingConfig(candidates=0)
+
+
+def test_a_warm_start_needs_something_beside_it():
+    with pytest.raises(ValueError, match="candidates must be at least 2 with a warm start"):
+        ShootingConfig(candidates=1)
+    ShootingConfig(candidates=1, warm_start=False)

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from torchrl_l1.algorithms.outcomes import Outcomes
 from torchrl_l1.checks import (
     check_choice,
+    check_count,
     check_counts,
     check_not_negative,
     check_positive,
@@ -68,7 +69,8 @@ def check_planning(settings: PlanSettings, optimizer: str, horizon: int) -> None
         horizon: actions in a plan.
     """
     check_sampling(settings.particles, settings.propagation, settings.precision)
-    if not 1 <= settings.replan_every <= horizon:
+    check_count("replan_every", settings.replan_every)
+    if not settings.replan_every <= horizon:
         raise ValueError(
             f"replan_every must be between 1 and {optimizer}.horizon ({horizon}), got "
             f"{settings.replan_every}"

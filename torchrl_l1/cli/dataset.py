@@ -6,7 +6,8 @@ import argparse
 import re
 from pathlib import Path
 
-from torchrl_l1.experiment.datasets import check_output, is_minari_name, write_dataset
+from torchrl_l1.experiment.datasets import is_minari_name
+from torchrl_l1.experiment.episodes import check_output, write_dataset
 from torchrl_l1.experiment.errors import typed_override
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.files import make_place

@@ -35,6 +35,7 @@ def export_command(options: argparse.Namespace) -> None:
     )
     print(f"Inputs:  {', '.join(found.inputs)}")
     print(f"Outputs: {', '.join(found.outputs)}")
+    print(f"Step:    {found.dt:.6g} s, preset {found.preset}")
     if found.transforms:
         print(f"Outside: {', '.join(found.transforms)}")
     print(f"Largest difference in {found.steps} steps: {found.error:.3g} action units")

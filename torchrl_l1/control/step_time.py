@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import gymnasium
 from torchrl.envs import EnvBase, FrameSkipTransform, PendulumEnv, SerialEnv, TransformedEnv
 
 # Wrappers of Gymnasium that repeat an action keep the number under one of these, by custom.
@@ -13,18 +14,21 @@ _REPEATS = ("_skip", "skip", "_frame_skip", "frame_skip", "action_repeat")
 _TOLERANCE = 1e-4
 
 
-def time_step(env: EnvBase) -> float | None:
+def time_step(env: EnvBase | gymnasium.Env[Any, Any]) -> float | None:
     """Time of one step of an environment in seconds; ``None`` where it does not tell.
 
     Read from: an attribute ``dt`` of the environment or of its ``task``, of the Gymnasium
     environment inside, ``control_timestep`` of dm_control; times the frames that wrappers and
-    transforms skip. Environments in other processes are not asked.
+    transforms skip. Environments in other processes are not asked. One of Gymnasium's may also be
+    given as it is.
 
     Examples:
         >>> from torchrl.envs import GymEnv
         >>> time_step(GymEnv("Pendulum-v1", frame_skip=2))
         0.1
     """
+    if isinstance(env, gymnasium.Env):
+        return _of_wrapped(env)
     if isinstance(env, TransformedEnv):
         inner = time_step(env.base_env)
         for transform in env.transform.modules():

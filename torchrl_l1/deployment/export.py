@@ -30,14 +30,13 @@ from torchrl_l1.control.pipeline import transforms_of
 from torchrl_l1.deployment.assessment import run_episodes
 from torchrl_l1.deployment.policies import FunctionPolicy
 from torchrl_l1.deployment.robust_controller import RobustController
+from torchrl_l1.deployment.unrolled import UNROLLED
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.envs.references import require
 from torchrl_l1.experiment.files import make_place
 
 FORMATS = {".pt": "torchscript", ".ts": "torchscript", ".onnx": "onnx", ".pt2": "export"}
 """What a file holds, by its suffix."""
-
-_aten = torch.ops.aten
 
 # Draws around the recorded steps, and the difference there, as a fraction of half the action's
 # range: rounding counts for more far from the data.
@@ -117,6 +116,8 @@ class Exported:
         outputs: names of the outputs.
         error: largest difference of the executed input on recorded steps, action units.
         steps: how many steps that were.
+        dt: time between two calls of the function, s; at another the controller is wrong.
+        preset: settings of L1 that act in it.
         transforms: of the environment, from the plant on, through which observation and action go
             outside the file; where parts are joined to an observation, with these in order.
     """
@@ -126,6 +127,8 @@ class Exported:
     outputs: tuple[str, ...]
     error: float
     steps: int
+    dt: float
+    preset: str
     transforms: tuple[str, ...] = ()
 
 
@@ -149,6 +152,8 @@ def export(
     ``started`` (bool).
 
     Observation and action are those behind the environment's transforms, which are not written.
+    ``dt``, the time between two calls, and ``preset`` are in the file as text: ``_extra_files`` of
+    TorchScript, ``extra_files`` of ``torch.export``, metadata of ONNX.
 
     Args:
         robust: what is written.
@@ -185,24 +190,30 @@ def export(
     config, recorded = _recorded(robust, preset, steps, seed)
     steps = len(recorded)  # the episode may end before
     policy = robust.policy if with_policy else None
-    module = ControlledStep(policy, robust.model, config).eval()
-    names = list(module.fresh)
-    inputs = ("observation", *([] if with_policy else ["u_rl"]), *names)
-    outputs = ("action", *(f"next_{name}" for name in names))
+    preset = robust.preset if preset is None else preset
+    facts = {"dt": str(config.dt), "preset": preset}
     first = recorded["observation"][:1]
     given = () if with_policy else (recorded["action"][:1],)
-    example = (first, *given, *module.fresh.values())
+    module: ControlledStep | None = None
     # In a folder of its own: what is there already stays if this one is no good.
     with torch.no_grad(), _quiet() as told, TemporaryDirectory() as folder:
         written = Path(folder, f"function{file.suffix}")
         try:
-            step = _WRITERS[format](module, example, written, inputs, outputs)
+            module = ControlledStep(policy, robust.model, config).eval()
+            names = list(module.fresh)
+            inputs = ("observation", *([] if with_policy else ["u_rl"]), *names)
+            outputs = ("action", *(f"next_{name}" for name in names))
+            example = (first, *given, *module.fresh.values())
+            step = _WRITERS[format](module, example, written, facts, inputs, outputs)
         except Exception as error:  # of the tracers, anything
             if not with_policy:
                 raise
             why = next(iter(str(error).split("\n", 1)), "").strip() or type(error).__name__
             why = _DECIDES if isinstance(error, GuardOnDataDependentSymNode) else why
-            other = "try .pt2, or " * (format != "export" and why != _DECIDES)
+            other = ""
+            if module is not None and why != _DECIDES:  # else none can write it
+                better = ".pt" if module.scripts else ".pt2"
+                other = f"try {better}, or " * (format != FORMATS[better])
             raise ValueError(
                 f"the policy cannot be written as {format} ({why}): {other}export L1 alone "
                 "(with_policy=False, --without-policy)"
@@ -243,7 +254,7 @@ def export(
             stacklevel=2,
         )
     write_atomically(file, content)
-    return Exported(file, inputs, outputs, worst, steps, outside)
+    return Exported(file, inputs, outputs, worst, steps, config.dt, preset, outside)
 
 
 def _outside(env: EnvBase) -> list[str]:
@@ -361,15 +372,25 @@ def _looked_at(told: Sequence[warnings.WarningMessage]) -> list[str]:
 
 
 def _torchscript(
-    module: ControlledStep, example: tuple[Tensor, ...], file: Path, *_: object
+    module: ControlledStep,
+    example: tuple[Tensor, ...],
+    file: Path,
+    facts: dict[str, str],
+    *_: object,
 ) -> Step:
     traced = torch.jit.freeze(torch.jit.trace(module, example, check_trace=False).eval())
-    torch.jit.save(traced, str(file))
+    torch.jit.save(traced, str(file), _extra_files=facts)
     return torch.jit.load(str(file))
 
 
-def _program(module: ControlledStep, example: tuple[Tensor, ...], file: Path, *_: object) -> Step:
-    torch.export.save(torch.export.export(module, example), str(file))
+def _program(
+    module: ControlledStep,
+    example: tuple[Tensor, ...],
+    file: Path,
+    facts: dict[str, str],
+    *_: object,
+) -> Step:
+    torch.export.save(torch.export.export(module, example), str(file), extra_files=facts)
     return torch.export.load(str(file)).module()
 
 
@@ -377,14 +398,17 @@ def _onnx(
     module: ControlledStep,
     example: tuple[Tensor, ...],
     file: Path,
+    facts: dict[str, str],
     inputs: Sequence[str],
     outputs: Sequence[str],
 ) -> Step:
-    program = torch.export.export(module, example).run_decompositions(_UNROLLED)
-    torch.onnx.export(
-        program, example, str(file), dynamo=True, verbose=False, external_data=False,
-        input_names=list(inputs), output_names=list(outputs),
+    program = torch.onnx.export(
+        torch.export.export(module, example).run_decompositions(UNROLLED), example,
+        dynamo=True, verbose=False, input_names=list(inputs), output_names=list(outputs),
     )  # fmt: skip
+    assert program is not None
+    program.model.metadata_props.update(facts)
+    program.save(str(file), external_data=False)
     runtime = require("onnxruntime", "onnx")
     session = runtime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
     # What does not matter to any output is no input of the graph.
@@ -418,63 +442,3 @@ def _quiet() -> Iterator[list[warnings.WarningMessage]]:
     finally:
         for logger, before in loggers.items():
             logger.setLevel(before)
-
-
-# ONNX has no triangular factors or solutions: for the few rows of a state they are unrolled.
-
-
-def cholesky(matrix: Tensor, *_: object, **__: object) -> tuple[Tensor, Tensor]:
-    """``torch.linalg.cholesky_ex`` in elementary operations.
-
-    Examples:
-        >>> matrix = torch.tensor([[4.0, 2.0], [2.0, 5.0]])
-        >>> cholesky(matrix)[0]
-        tensor([[2., 0.],
-                [1., 2.]])
-    """
-    columns: list[Tensor] = []
-    for j in range(matrix.shape[-1]):
-        column = matrix[..., j:, j]
-        for known in columns:
-            column = column - known[..., j:] * known[..., j : j + 1]
-        column = column / column[..., :1].sqrt()
-        columns.append(torch.cat([torch.zeros_like(matrix[..., :j, j]), column], -1))
-    factor = torch.stack(columns, -1)
-    diagonal = torch.stack([known[..., j] for j, known in enumerate(columns)], -1)
-    failed = ~(diagonal > 0).all(-1)
-    return factor, failed.to(torch.int32)
-
-
-def solve_triangular(
-    matrix: Tensor, right: Tensor, *, upper: bool, left: bool = True, unitriangular: bool = False
-) -> Tensor:
-    """``torch.linalg.solve_triangular`` from the left in elementary operations.
-
-    Examples:
-        >>> matrix = torch.tensor([[2.0, 0.0], [1.0, 2.0]])
-        >>> solve_triangular(matrix, torch.tensor([[2.0], [5.0]]), upper=False).squeeze(-1)
-        tensor([1., 2.])
-    """
-    assert left and not unitriangular
-    size = matrix.shape[-1]
-    rows: dict[int, Tensor] = {}
-    for i in reversed(range(size)) if upper else range(size):
-        row = right[..., i, :]
-        for k, known in rows.items():
-            row = row - matrix[..., i, k, None] * known
-        rows[i] = row / matrix[..., i, i, None]
-    return torch.stack([rows[i] for i in range(size)], -2)
-
-
-def cholesky_solve(right: Tensor, factor: Tensor, upper: bool = False) -> Tensor:
-    """``torch.cholesky_solve`` of a lower factor in elementary operations."""
-    assert not upper
-    lower = solve_triangular(factor, right, upper=False)
-    return solve_triangular(factor.mT, lower, upper=True)
-
-
-_UNROLLED: dict[Any, Callable[..., Any]] = {
-    _aten.linalg_cholesky_ex.default: cholesky,
-    _aten.linalg_solve_triangular.default: solve_triangular,
-    _aten.cholesky_solve.default: cholesky_solve,
-}

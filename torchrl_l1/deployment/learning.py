@@ -94,8 +94,8 @@ class Acting(TensorDictModuleBase):
         if self.beyond:
             warnings.warn(
                 f"{self.beyond} of {self.steps} actions of the policy lie beyond the environment's "
-                "bounds: L1 and the oracle stay within them, and without L1 nothing clips, so that "
-                "their rows differ by that too; clip the action in the policy",
+                "bounds: L1 and the oracle clip them, and without L1 disturbances act on them as "
+                "they are, so that their rows differ by that too; clip the action in the policy",
                 stacklevel=2,
             )
 

@@ -35,8 +35,6 @@ Policy: TypeAlias = str | TensorDictModuleBase | nn.Module | Callable[[Tensor], 
 NO_NORMALIZATION = "none"
 """In place of the file of VecNormalize: there is one, and it is to be left alone."""
 
-_STATISTICS = "vecnormalize.pkl"
-
 _FORMS = "sb3:FILE.zip, torchscript:FILE, onnx:FILE, MODULE:NAME, FILE.py:NAME, or a run directory"
 
 
@@ -413,8 +411,8 @@ _FILES: dict[str, Callable[[str], Any]] = {
 
 def _stable_baselines(file: Path, normalization: str | None) -> StableBaselinesPolicy:
     require("stable_baselines3", "sb3")
-    beside = file.with_name(_STATISTICS)
-    if normalization is None and beside.exists():
+    beside = _statistics(file)
+    if normalization is None and beside is not None:
         raise ValueError(
             f"{beside} stands beside {file.name}: give it as normalization (--normalization "
             f"{beside}), which loads a pickle and so executes what is in it, or say "
@@ -429,6 +427,19 @@ def _stable_baselines(file: Path, normalization: str | None) -> StableBaselinesP
         with open(str(normalization), "rb") as handle:
             stored = pickle.load(handle)
     return StableBaselinesPolicy(model.policy, _moments(stored))
+
+
+def _statistics(file: Path) -> Path | None:
+    """A file that is named like VecNormalize's, beside a model or in the folder of its name."""
+    found = [
+        one
+        for folder in (file.parent, file.with_suffix(""))
+        for one in folder.glob("*.pkl")
+        if "vecnorm" in one.name.lower().replace("_", "").replace("-", "")
+    ]
+    # CheckpointCallback writes one for each of its models, named alike.
+    found.sort(key=lambda one: (one.stem.replace("vecnormalize_", "") != file.stem, one))
+    return found[0] if found else None
 
 
 def _check_spaces(policy: Any) -> None:

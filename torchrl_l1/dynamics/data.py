@@ -15,15 +15,17 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_l1.dynamics.episode_ends import (
+    check_ends,
+    check_no_end_within,
+    tells_of_ends,
+    told_ends,
+)
+
 if TYPE_CHECKING:
     from minari import MinariDataset
 
 _Path = str | os.PathLike[str]
-
-# What flags of an episode's end are called, by D4RL, Minari, Gymnasium and TorchRL among others.
-_ENDS = ("done", "terminal", "terminated", "termination", "timeout", "truncated", "truncation")
-
-_FALSE = ("", "false", "f", "no", "n", "none")
 
 # Steps of time that differ by more from the usual one are gaps.
 _JITTER = 0.1
@@ -66,8 +68,9 @@ def read_csv(
         FileNotFoundError: if there is no such file.
         KeyError: if there is no such column.
         ValueError: for a cell that is no number, a line with more cells than there are columns or
-            without its episode, if no two lines follow each other, or if a column such as
-            ``done`` tells of ends between lines that would follow each other.
+            without its episode, if no two lines follow each other, or if a column that is not
+            named, such as ``done``, ``is_first``, ``run`` or ``time``, tells of ends between lines
+            that would follow each other.
 
     Examples:
         >>> from pathlib import Path
@@ -93,10 +96,8 @@ def read_csv(
         raise ValueError(f"{path} is no text in UTF-8 ({error.reason}): save it as such") from None
     except csv.Error as error:
         raise ValueError(f"{path} is no table of text: {error}") from None
-    ends = {
-        name: np.array([_is_set(cell) for cell in columns[name]], dtype=bool)
-        for name in columns
-        if name not in wanted
+    told = {
+        name: np.array(cells) for name, cells in columns.items() if cells and name not in wanted
     }
     x, u = (
         torch.tensor([columns[name] for name in names], dtype=torch.float64).T
@@ -104,7 +105,7 @@ def read_csv(
     )
     clock = None if time is None else torch.tensor(columns[time], dtype=torch.float64)
     labels = None if episode is None else np.array(columns[episode])
-    return _rows(str(path), x, u, labels, clock, ends)
+    return _rows(str(path), x, u, labels, clock, told)
 
 
 def read_npz(
@@ -167,11 +168,11 @@ def read_npz(
 
     x, u = side_by_side(observation), side_by_side(action)
     names = [one for given in (observation, action, episode, time) for one in _listed(given)]
-    ends = {
-        key: _set_rows(flags, len(x))
-        for key, flags in arrays.items()
-        if _is_end(key) and key not in names
-        if flags.ndim and flags.size and flags.dtype.kind in "fiub"
+    told = {
+        key: values
+        for key, values in arrays.items()
+        if tells_of_ends(key) and key not in names
+        if values.ndim and values.size and values.dtype.kind in "fiubU"
     }
     if len(x) == len(u) + 1:
         u = torch.cat([u, u.new_zeros(1, u.shape[-1])])
@@ -183,7 +184,7 @@ def read_npz(
     for name, values in (("action", u), (time, clock), (episode, labels)):
         if values is not None and len(values) != len(x):
             raise ValueError(f"{path}: {name} has {len(values)} rows, the observation {len(x)}")
-    return _rows(str(path), x, u, labels, clock, ends)
+    return _rows(str(path), x, u, labels, clock, told)
 
 
 def read_minari(dataset: str | MinariDataset, download: bool = False) -> TensorDict:
@@ -260,7 +261,7 @@ def _columns(
                 raise KeyError(f"{path} has no column {name!r}, only {there}{hint}")
             if header.count(name) > 1:
                 raise ValueError(f"{path} has {header.count(name)} columns {name!r}: rename them")
-        extra = [name for name in header if _is_end(name) and name not in wanted]
+        extra = [name for name in header if tells_of_ends(name) and name not in wanted]
         places = {name: header.index(name) for name in [*wanted, *extra]}
         columns: dict[str, list[Any]] = {name: [] for name in places}
         for line in lines:
@@ -301,52 +302,6 @@ def _listed(names: str | Sequence[str] | None) -> list[str]:
     return [names] if isinstance(names, str) else list(names or ())
 
 
-def _is_set(cell: str) -> bool:
-    """Whether a flag is, however it is written."""
-    try:
-        number = float(cell)
-    except ValueError:
-        return cell.lower() not in _FALSE
-    return number != 0 and number == number
-
-
-def _set_rows(flags: np.ndarray, count: int) -> np.ndarray:
-    """In which of so many rows a flag is set."""
-    found = (flags != 0) & (flags == flags)
-    return found.reshape(count if flags.size == count else len(flags), -1).any(-1)
-
-
-def _is_end(name: str) -> bool:
-    return name.lower().removeprefix("is_").rstrip("s") in _ENDS
-
-
-def _check_ends(path: str, name: str, ends: np.ndarray) -> None:
-    """Refuse a file that tells of several episodes where it is to be read as one."""
-    count = int(ends[:-1].sum())
-    if count:
-        raise ValueError(
-            f"{path} tells by {name!r} of {count} episodes that end before the last row, and would "
-            "be read as one: name what numbers them as episode, such as the running count of their "
-            "starts, or the time"
-        )
-
-
-def _check_no_end_within(path: str, name: str, ends: Tensor, joined: Tensor) -> None:
-    """Refuse a file that tells of ends after which an episode would go on.
-
-    A flag may stand in the row whose action ended the episode, with the last observation behind
-    it, so that only a second row behind it is one too many.
-    """
-    count = int((ends[:-2] & joined[:-1] & joined[1:]).sum())
-    if count:
-        raise ValueError(
-            f"{path} tells by {name!r} of {count} ends within what episode and time say are single "
-            "episodes, and steps across them would be taken for the plant's: name what numbers "
-            "all episodes as episode, such as the running count of their starts; leave out rows "
-            "behind an end; or rename the column if it is of something else"
-        )
-
-
 def _episodes(path: str, labels: np.ndarray) -> Tensor:
     """Numbers of the episodes that rows are labelled with."""
     missing = np.array([str(label).lower() in ("", "nan") for label in labels.tolist()], dtype=bool)
@@ -364,14 +319,15 @@ def _rows(
     u: Tensor,
     labels: np.ndarray | None,
     clock: Tensor | None,
-    ends: Mapping[str, np.ndarray],
+    told: Mapping[str, np.ndarray],
 ) -> TensorDict:
     """Transitions between rows that follow each other."""
+    ends = told_ends(told, len(x), labels is not None)
     ids = torch.zeros(len(x), dtype=torch.long)
     blocks, order = ids, torch.arange(len(x))
     if labels is None and clock is None:
         for name, flags in ends.items():
-            _check_ends(path, name, flags)
+            check_ends(path, name, flags)
     if labels is not None and len(labels):
         ids = _episodes(path, labels)
         blocks[1:] = (ids[1:] != ids[:-1]).cumsum(0)
@@ -396,7 +352,7 @@ def _rows(
     for name, flags in ends.items():
         ended = torch.zeros(len(x), dtype=torch.bool)
         ended[: len(flags)] = torch.from_numpy(flags[: len(x)])
-        _check_no_end_within(path, name, ended[order], joined)
+        check_no_end_within(path, name, ended[order], joined)
     if not joined.any():
         raise ValueError(f"{path} has {len(x)} rows, of which none follows another in its episode")
     trajectory = torch.cat([torch.zeros(1, dtype=torch.long), (~joined).cumsum(0)])

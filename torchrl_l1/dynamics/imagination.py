@@ -9,10 +9,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
-from torchrl_l1.checks import check_count
+from torchrl_l1.checks import LARGEST_BOUND, check_choice, check_count
 from torchrl_l1.dynamics.model import EnsembleDynamics
 from torchrl_l1.dynamics.network import ForwardPass, PlanningNetwork, Precision
 
@@ -66,8 +66,9 @@ def imagine(
         step that is ``done`` is not valid and means nothing; its rewards are zero.
 
     Raises:
-        ValueError: for no steps, start states of another shape, a reward or termination that is
-            not one number per row, or a function that writes to what it is given.
+        ValueError: for no steps, start states of another shape, bounds that are empty or of
+            another width, a policy that does not give one action per row, a reward or termination
+            that is not one number per row, or a function that writes to what it is given.
     """
     n, m = dynamics.observation_dim, dynamics.action_dim
     check_count("horizon", horizon)
@@ -78,6 +79,7 @@ def imagine(
     drawn = torch.randint(network.members, (horizon,)).tolist()
     memory: dict[tuple[torch.dtype, int], Tensor] = {}
     passes = {member: _forward_pass(network, batch, member, memory) for member in set(drawn)}
+    action_low, action_high = checked_bounds(action_low, action_high, start.new_empty(m))
     observations = start.new_empty(horizon + 1, batch, n)
     predicted = start.new_empty(horizon, batch, n)
     actions = start.new_empty(horizon, batch, m)
@@ -86,7 +88,13 @@ def imagine(
     holds = bool(box.fixed.any())
     observations[0] = observation = start
     for t, member in enumerate(drawn):
-        actions[t] = untouched(policy, "policy", observation)
+        action = untouched(policy, "policy", observation)
+        if action.shape != (batch, m):
+            raise ValueError(
+                f"the policy must give actions ({batch}, {m}) for observations ({batch}, {n}), got "
+                f"{tuple(action.shape)}"
+            )
+        actions[t] = action
         inputs[:, :n] = observation
         inputs[:, n:] = actions[t].clamp(action_low, action_high)
         change = passes[member](inputs)[:, :n]
@@ -141,6 +149,30 @@ def imagine(
     return TensorDict(columns, batch_size=[horizon, batch]).transpose(0, 1)
 
 
+def checked_bounds(
+    low: Tensor | float | Sequence[float], high: Tensor | float | Sequence[float], like: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Bounds of the action as ``(m,)``, in type and place those of actions ``(..., m)``.
+
+    Raises:
+        ValueError: if they are of another width, or leave no action between them.
+    """
+    width, bounds = like.shape[-1], []
+    for name, bound in (("low", low), ("high", high)):
+        tensor = torch.as_tensor(bound, dtype=like.dtype, device=like.device)
+        if tensor.dim() > 1 or tensor.numel() not in (1, width):
+            raise ValueError(
+                f"the action bound {name} has shape {tuple(tensor.shape)}, expected ({width},)"
+            )
+        bounds.append(tensor.expand(width))
+    if not (bounds[0] < bounds[1]).all():
+        raise ValueError(
+            "the action bounds are empty: low must be below high, got "
+            f"{bounds[0].tolist()} and {bounds[1].tolist()}"
+        )
+    return bounds[0], bounds[1]
+
+
 def one_each(function: Callable[..., Tensor], name: str, *inputs: Tensor) -> Tensor:
     """What a reward or a termination gives, which must be ``(...)`` for inputs ``(..., width)``.
 
@@ -191,29 +223,40 @@ def _forward_pass(
 
 
 class EnsembleWorldModel(TensorDictModuleBase):
-    """One imagined step as a TensorDictModule: next observation, reward and termination.
+    """One imagined step as a TensorDictModule: next observation, reward, and whether it ends.
 
     Args:
         dynamics: the ensemble.
         reward: maps observation, action and next observation to ``(...)``.
         propagation: ``"mean"`` of the ensemble, or a ``"random_member"`` of its elites per call.
+        terminated: maps next observations to whether the task ends there ``(...)``; never if
+            ``None``.
+        box_exit: what leaving the box around the data is: ``"fail"``, worth nothing from
+            there on, or ``"truncate"``, cut off where the model ends.
     """
 
     in_keys = ["observation", "action"]  # noqa: RUF012
-    out_keys = ["observation", "reward", "terminated", "done"]  # noqa: RUF012
+    out_keys = ["observation", "reward", "terminated", "truncated", "done"]  # noqa: RUF012
 
     def __init__(
-        self, dynamics: EnsembleDynamics, reward: RewardFunction, propagation: str = "mean"
+        self,
+        dynamics: EnsembleDynamics,
+        reward: RewardFunction,
+        propagation: str = "mean",
+        terminated: Termination | None = None,
+        box_exit: str = "fail",
     ) -> None:
         super().__init__()
-        if propagation not in ("mean", "random_member"):
-            raise ValueError(f"propagation must be 'mean' or 'random_member', got {propagation!r}")
+        check_choice("propagation", propagation, ("mean", "random_member"))
+        check_choice("box_exit", box_exit, ("fail", "truncate"))
         self.dynamics = dynamics
         self.reward = reward
         self.propagation = propagation
+        self.terminated = terminated
+        self.box_exit = box_exit
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Overwrite ``observation`` with the next one and write reward and termination."""
+        """Overwrite ``observation`` with the next one and write reward and ends."""
         observation, action = tensordict["observation"], tensordict["action"]
         if self.propagation == "mean":
             change = self.dynamics.mean_change(observation, action)
@@ -230,12 +273,17 @@ class EnsembleWorldModel(TensorDictModuleBase):
         # Outside, neither state nor reward mean anything.
         successor = torch.where(left, observation, successor)
         reward = one_each(self.reward, "reward", observation, action, successor)
+        fallen = torch.zeros_like(left)
+        if self.terminated is not None:
+            fallen = one_each(self.terminated, "terminated", successor).bool().unsqueeze(-1) & ~left
+        ends = self.box_exit == "fail"
         return tensordict.update(
             {
                 "observation": successor,
                 "reward": reward.to(change).unsqueeze(-1),
-                "terminated": left,
-                "done": left,
+                "terminated": fallen | left if ends else fallen,
+                "truncated": torch.zeros_like(left) if ends else left,
+                "done": fallen | left,
             }
         )
 
@@ -243,9 +291,10 @@ class EnsembleWorldModel(TensorDictModuleBase):
 class EnsembleModelEnv(ModelBasedEnvBase):
     """A learned ensemble as an environment for TorchRL's rollouts, collectors and planners.
 
-    It terminates where the state leaves the box around the model's data, in the last one inside,
-    which the reward of that step is of. Model and reward see the action within its bounds. For the
-    inner loop of an algorithm :func:`~torchrl_l1.dynamics.imagine` does the same faster.
+    It ends where the state leaves the box around the model's data, in the last one inside, which
+    the reward of that step is of, and where the task does. Model and reward see the action within
+    its bounds. For the inner loop of an algorithm :func:`~torchrl_l1.dynamics.imagine` is faster;
+    it draws a member per step.
 
     Args:
         dynamics: the ensemble.
@@ -254,7 +303,13 @@ class EnsembleModelEnv(ModelBasedEnvBase):
         action_low: lower bound of the actions, one number or one for each.
         action_high: upper bound.
         batch_size: environments side by side; ``()`` for planners, which bring their own.
-        propagation: see :class:`EnsembleWorldModel`.
+        propagation: see :class:`EnsembleWorldModel`, as for what follows.
+        terminated: where the task ends.
+        box_exit: what leaving the box is.
+
+    Raises:
+        ValueError: for bounds that are empty, not finite or of another width, or an unknown choice;
+            at a reset or step, for initial observations, rewards or terminations of another shape.
 
     Examples:
         >>> model = EnsembleDynamics(3, 1, members=2, hidden=(8,))
@@ -279,10 +334,12 @@ class EnsembleModelEnv(ModelBasedEnvBase):
         action_high: float | Sequence[float] | Tensor,
         batch_size: tuple[int, ...] = (),
         propagation: str = "mean",
+        terminated: Termination | None = None,
+        box_exit: str = "fail",
     ) -> None:
         device = next(dynamics.parameters()).device
         super().__init__(
-            EnsembleWorldModel(dynamics, reward, propagation),
+            EnsembleWorldModel(dynamics, reward, propagation, terminated, box_exit),
             device=device,
             batch_size=torch.Size(batch_size),
         )
@@ -293,12 +350,21 @@ class EnsembleModelEnv(ModelBasedEnvBase):
             observation=Unbounded((*batch_size, n), **kind), shape=batch_size, device=device
         )
         self.state_spec = self.observation_spec.clone()
-        low, high = (
-            torch.as_tensor(bound, **kind).expand(*batch_size, m)
-            for bound in (action_low, action_high)
-        )
-        self.action_spec = Bounded(low, high, (*batch_size, m), **kind)
+        low, high = checked_bounds(action_low, action_high, torch.empty(m, **kind))
+        if not (torch.maximum(low.abs(), high.abs()) < LARGEST_BOUND).all():
+            raise ValueError(
+                f"the action bounds must be finite, got {low.tolist()} and {high.tolist()}: give "
+                "numbers between which to act"
+            )
+        shape = (*batch_size, m)
+        self.action_spec = Bounded(low.expand(shape), high.expand(shape), shape, **kind)
         self.reward_spec = Unbounded((*batch_size, 1), **kind)
+        flag = Binary(1, (*batch_size, 1), dtype=torch.bool, device=device)
+        self.full_done_spec = Composite(
+            {name: flag.clone() for name in ("done", "terminated", "truncated")},
+            shape=batch_size,
+            device=device,
+        )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         space = self.action_spec.space
@@ -308,7 +374,13 @@ class EnsembleModelEnv(ModelBasedEnvBase):
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: object) -> TensorDict:
         shape = self.batch_size if tensordict is None else tensordict.shape
         spec = self.observation_spec["observation"]
-        observation = self.start(max(1, shape.numel())).to(self.device, spec.dtype)
+        count = max(1, shape.numel())
+        observation = self.start(count).to(self.device, spec.dtype)
+        if observation.shape != (count, spec.shape[-1]):
+            raise ValueError(
+                f"start({count}) must give observations ({count}, {spec.shape[-1]}), got "
+                f"{tuple(observation.shape)}"
+            )
         return TensorDict(
             {"observation": observation.reshape(*shape, -1)},
             batch_size=shape,

@@ -32,6 +32,8 @@ class EnsembleDynamicsLoss(LossModule):
 
     Raises:
         KeyError: if an input key is missing.
+        ValueError: for observations of different shapes, another batch size, or numbers of another
+            type than the model's.
 
     Examples:
         >>> import torch
@@ -81,6 +83,24 @@ class EnsembleDynamicsLoss(LossModule):
                     f"EnsembleDynamicsLoss: {key!r} is not among {tensordict.keys(True, True)}"
                 )
         model = self.dynamics
+        if next_observation.shape != observation.shape:
+            raise ValueError(
+                f"EnsembleDynamicsLoss: {self.in_keys[2]!r} has shape "
+                f"{tuple(next_observation.shape)}, {self.in_keys[0]!r} {tuple(observation.shape)}"
+            )
+        members, batch = model.members, tuple(observation.shape[:-1])
+        if not (len(batch) == 1 or (len(batch) == 2 and batch[0] == members)):
+            raise ValueError(
+                f"EnsembleDynamicsLoss: data of batch size {batch} must be of [B] for all members, "
+                f"or of [{members}, B] for each its own: reshape them with reshape(-1)"
+            )
+        expected = model.change_normalizer.mean.dtype
+        for key, value in zip(self.in_keys, (observation, action, next_observation), strict=True):
+            if value.dtype != expected:
+                raise ValueError(
+                    f"EnsembleDynamicsLoss: {key!r} is {value.dtype}, the model {expected}: "
+                    "convert one of them"
+                )
         inputs = model.normalize_inputs(observation, action)
         target = model.change_normalizer.normalize(next_observation - observation)
         per_member = model.head.loss(model.raw(inputs), target).mean(-1)
@@ -94,7 +114,13 @@ class EnsembleDynamicsLoss(LossModule):
 def evaluate_members(
     loss: EnsembleDynamicsLoss, data: TensorDictBase, chunk: int = 20_000
 ) -> Tensor:
-    """Mean loss of every member on the same data ``[N]``: ``(E,)``."""
+    """Mean loss of every member on the same data ``[N]``: ``(E,)``.
+
+    Raises:
+        ValueError: if there are none.
+    """
+    if data.shape[0] == 0:
+        raise ValueError("evaluate_members: there are no data")
     total = torch.zeros(loss.dynamics.members)
     for part in data.split(chunk):
         total = total.to(part.device) + loss(part)["member_loss"] * part.shape[0]

@@ -115,7 +115,10 @@ class EnsembleDynamics(nn.Module):
             raise ValueError(f"elites must be one member or more, each once, got {chosen}")
         if chosen[0] < 0 or chosen[-1] >= self.members:
             raise ValueError(f"elites must be in 0 to {self.members - 1}, got {chosen}")
-        self.elites = torch.tensor(chosen, device=self.elites.device)
+        if len(chosen) == len(self.elites):
+            self.elites.copy_(torch.tensor(chosen))  # where other processes see it, too
+        else:
+            self.elites = torch.tensor(chosen, device=self.elites.device)
 
     def fit_statistics(self, observation: Tensor, action: Tensor, change: Tensor) -> None:
         """Set the normalisers and the data box from samples ``(N, n)``, ``(N, m)``, ``(N, n)``.

@@ -360,7 +360,7 @@ class ActuatorDelay(DelayLine, _Actuator):
 
     Args:
         steps: whole number; one, one for each action entry, one row for each environment, or
-            drawn at resets.
+            drawn at resets and rounded down.
         action_key: key of the action.
 
     Raises:

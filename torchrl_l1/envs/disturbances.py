@@ -231,6 +231,10 @@ class HeldDisturbance(EnvironmentTransform):
     def _check(self, value: Tensor) -> None:
         """Refuse values that the disturbance cannot have."""
 
+    def _admitted(self, drawn: Tensor) -> Tensor:
+        """What is drawn, as a value that the disturbance can have."""
+        return drawn
+
     def _require(self, sound: bool, rule: str, value: Tensor) -> None:
         if not sound:
             raise ValueError(f"{type(self).__name__}: {rule}, got {value.tolist()}")
@@ -242,7 +246,7 @@ class HeldDisturbance(EnvironmentTransform):
     def _drawn(self, entry: Tensor) -> dict[str, Tensor]:
         if self.draw is None:
             return {}
-        value = self.draw(entry.shape).to(entry.device)
+        value = self._admitted(self.draw(entry.shape).to(entry.device))
         if value.shape not in (entry.shape, (*entry.shape[:-1], 1)) or not value.isfinite().all():
             raise ValueError(
                 f"{type(self).__name__} drew values of shape {tuple(value.shape)}, expected finite "
@@ -325,6 +329,9 @@ def _with_axes_of(entry: Tensor, mask: Tensor) -> Tensor:
 
 class DelayLine(HeldDisturbance):
     """Delivers what came in a number of steps ago."""
+
+    def _admitted(self, drawn: Tensor) -> Tensor:
+        return drawn.floor()
 
     def _check(self, value: Tensor) -> None:
         whole = (value >= 0) & (value == value.round())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -28,10 +29,10 @@ from torchrl_l1.envs.mujoco_env import (
     stepped_rows,
 )
 from torchrl_l1.envs.plant import Plant, cannot_change, disturbed_model, survives_resets
-from torchrl_l1.envs.references import making
+from torchrl_l1.envs.references import code_digests, making
 from torchrl_l1.envs.simulation import LARGEST, turned_bad
 from torchrl_l1.envs.single import PAGE, SingleEnv, SingleGymnasiumEnv, SingleTorchRLEnv
-from torchrl_l1.envs.sources import EnvironmentSource, environment_source
+from torchrl_l1.envs.sources import EnvironmentSource, environment_source, the_same
 from torchrl_l1.envs.task import BadAction, RewardFn, Scalars, Task
 
 
@@ -83,10 +84,19 @@ class ExternalTask:
             self.action_low, self.action_high = _scalars(single.low), _scalars(single.high)
             self.dt = self._told("dt", "SECONDS", "how long a step takes", dt, single.time_step())
             if dt is not None and abs(dt - self.dt) > 1e-6 * self.dt:
-                raise ValueError(f"dt: a step of {self.name} takes {self.dt:g} s, not {dt:g}")
+                raise ValueError(
+                    f"dt: a step of {self.name} takes {self.dt:g} s, not {dt:g}: leave dt out, or "
+                    "correct the environment's own, if that is wrong"
+                )
+            told = single.horizon()
             self.horizon = horizon or self._told(
-                "horizon", "STEPS", "how long an episode is", None, single.horizon()
+                "horizon", "STEPS", "how long an episode is", None, told
             )
+            if told is not None and told < self.horizon and not source.gymnasium_id:
+                raise ValueError(
+                    f"horizon: an episode of {self.name} ends after {told} steps, not "
+                    f"{horizon}: leave horizon out, or raise the environment's own limit"
+                )
             self.outcome = single.outcome()
             self.has_plant = single.simulation() is not None
         finally:
@@ -111,7 +121,7 @@ class ExternalTask:
         env = self.source.build()
         plain = type(env) in (GymEnv, GymWrapper) and getattr(env, "wrapper_frame_skip", 1) == 1
         if plain and isinstance(env._env, gymnasium.Env):
-            return SingleGymnasiumEnv(env._env, self.name, self._keys)
+            return SingleGymnasiumEnv(env, self.name, self._keys)
         return SingleTorchRLEnv(env, self.name, self._keys)
 
     @property
@@ -224,6 +234,8 @@ class ExternalEnv(CPUEnv):
         self.task, self.num_envs, self.max_steps, self._dtype = task, num_envs, max_steps, dtype
         task.check_disturbances(list(plant or {}))
         self.members = [task._single(limited=False) for _ in range(num_envs)]
+        if len({id(member.innermost()) for member in self.members}) < num_envs:
+            raise ValueError(the_same(task.name))
         self._models = [member.simulation().model for member in self.members if plant]
         self._plant = Plant(self._models[0], num_envs, plant) if plant else None
         self._change_plant(np.arange(num_envs))
@@ -309,7 +321,6 @@ class ExternalEnv(CPUEnv):
         super().close(raise_if_closed=raise_if_closed)
 
 
-@cache
 def external_task(
     name: str,
     dt: float | None = None,
@@ -322,9 +333,28 @@ def external_task(
     Raises:
         ValueError: for a name that stands for nothing, or an environment that will not do.
     """
+    code = code_digests([name], search_path)
+    return _read(name, dt, horizon, observation_keys, search_path, Path.cwd(), *code.items())
+
+
+@cache
+def _read(
+    name: str,
+    dt: float | None,
+    horizon: int | None,
+    observation_keys: tuple[str, ...],
+    search_path: tuple[str | Path, ...],
+    *state: object,
+) -> Task | ExternalTask:
+    """Read once, for each state of the folder and the code that the name leads to."""
     source = environment_source(name, search_path)
     if source.task is not None:
         return source.task
     if not source.gymnasium_id and isinstance(env := source.build(), BatchedMujocoEnv):
-        return env.task
+        if env._simulation.simulator.plant is not None:
+            raise ValueError(
+                f"{name} returns an environment with another plant than its task's: let it return "
+                "the task, and give the changes as disturbances"
+            )
+        return replace(env.task, horizon=env.max_steps)
     return ExternalTask(source, dt=dt, horizon=horizon, observation_keys=observation_keys)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import gymnasium
 import torch
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
+from torchrl_l1.checks import check_optional_count
 from torchrl_l1.envs.external import external_task
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
 from torchrl_l1.envs.perturbations import (
@@ -41,7 +43,7 @@ def get_task(
         task: a key of :data:`~torchrl_l1.envs.TASKS`, the name of any environment as
             :func:`~torchrl_l1.envs.environment_source` takes it, or a task of your own.
         dt: seconds of a step, where an environment of elsewhere does not tell.
-        horizon: steps of an episode, where an environment of elsewhere does not tell.
+        horizon: steps of an episode, where an environment of elsewhere does not tell, or fewer.
         observation_keys: parts of the observation, where that of an environment comes in parts.
         search_path: folders for files and modules that the name names.
 
@@ -59,16 +61,26 @@ def get_task(
         >>> get_task("gymnasium/Pendulum-v1").horizon
         200
     """
+    check_optional_count("horizon", horizon)
+    found: AnyTask
     if not isinstance(task, str):
-        return task
-    if task in TASKS or is_plain(task):
+        found = task
+    elif task in TASKS or is_plain(task):
         found = built_in_task(task)
+    else:
+        found = external_task(task, dt, horizon, tuple(observation_keys), tuple(search_path))
+    name = found.name
+    if isinstance(found, Task):
         if dt is not None and dt != found.dt:
-            raise ValueError(f"dt: a step of {task} takes {found.dt:g} s; leave dt out")
+            raise ValueError(f"dt: a step of {name} takes {found.dt:g} s; leave dt out")
         if observation_keys:
-            raise ValueError(f"observation_keys: the observation of {task} is one vector")
-        return found
-    return external_task(task, dt, horizon, tuple(observation_keys), tuple(search_path))
+            raise ValueError(f"observation_keys: the observation of {name} is one vector")
+        return found if horizon in (None, found.horizon) else replace(found, horizon=horizon)
+    if found is task and (dt or horizon or observation_keys):
+        raise ValueError(
+            f"dt, horizon and observation_keys go with a name; give them where {name} is made"
+        )
+    return found
 
 
 def make_env(
@@ -82,6 +94,10 @@ def make_env(
     max_steps: int | None = None,
     dtype: torch.dtype = torch.float32,
     threads: int = 1,
+    dt: float | None = None,
+    horizon: int | None = None,
+    observation_keys: Sequence[str] = (),
+    search_path: Sequence[str | Path] = (),
     **disturbances: Any,
 ) -> TransformedEnv:
     r"""Build a benchmark environment with noise, disturbances and further transforms.
@@ -111,6 +127,10 @@ def make_env(
         max_steps: steps after which an episode is truncated; the task's horizon if ``None``.
         dtype: floating dtype of observation, action and reward.
         threads: threads that share the physics.
+        dt: as :func:`get_task` takes it.
+        horizon: as there.
+        observation_keys: as there.
+        search_path: as there.
         **disturbances: values of the disturbances of :class:`~torchrl_l1.envs.Perturbation`, by
             their settings or by their names in :data:`~torchrl_l1.envs.DISTURBANCES`. Each is
             what its transform takes (a number, one for each entry, one row for each environment)
@@ -138,7 +158,13 @@ def make_env(
     if observation_noise != 0:
         transforms.append(ObservationNoise(observation_noise))
     transforms += sensors
-    found = get_task(task)
+    found = get_task(
+        task,
+        dt=dt,
+        horizon=horizon,
+        observation_keys=observation_keys,
+        search_path=search_path,
+    )
     warn_of_late(active, max_steps or found.horizon)
     settings: dict[str, Any] = {
         "seed": seed,

@@ -90,6 +90,8 @@ def load_module(name: str, search_path: Sequence[str | Path] = ()) -> ModuleType
         return import_module(name)
     except (ImportError, TypeError, ValueError) as error:
         raise ValueError(f"there is no module {name!r} ({error})") from None
+    except Exception as error:
+        raise ValueError(_broken(name, error)) from error
 
 
 def folders_of(names: Iterable[str], folders: Iterable[Path]) -> list[str]:
@@ -195,6 +197,16 @@ def _of_file(file: Path, changed: int) -> ModuleType:
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     # As of an import: what the file defines may look its own module up.
-    sys.modules.setdefault(file.stem, module)
-    spec.loader.exec_module(module)
+    is_ours = sys.modules.setdefault(file.stem, module) is module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        if is_ours:
+            sys.modules.pop(file.stem, None)
+        raise ValueError(_broken(str(file), error)) from error
     return module
+
+
+def _broken(name: str, error: Exception) -> str:
+    said = f"{type(error).__name__}: {error}"
+    return f"{name} cannot be imported ({' '.join(said.split())})"

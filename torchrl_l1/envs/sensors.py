@@ -92,7 +92,7 @@ class SensorDelay(DelayLine, _Sensor):
 
     Args:
         steps: whole number; one, one for each entry, one row for each environment, or drawn at
-            resets.
+            resets and rounded down.
         observation_key: key of the observation.
 
     Raises:

@@ -4,28 +4,36 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Protocol
+from copy import deepcopy
+from typing import Any, Protocol, TypeGuard
 
 import gymnasium
-import mujoco
 import numpy as np
 import torch
-from gymnasium.spaces import Box, Dict
+from gymnasium.spaces import Box, Dict, Space
+from gymnasium.utils import EzPickle
 from tensordict import TensorDictBase
 from torchrl.data import Bounded
 from torchrl.envs import EnvBase, FrameSkipTransform, GymWrapper, StepCounter, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.envs.utils import step_mdp
 
+from torchrl_l1.checks import LARGEST_BOUND
 from torchrl_l1.control import repeats, time_step
 from torchrl_l1.envs.known_rewards import Outcome, known_outcome
-from torchrl_l1.envs.sources import check_keys, simulation_of, vector_environment, vectors
+from torchrl_l1.envs.sources import (
+    check_keys,
+    innermost,
+    parts_left_out,
+    simulation_of,
+    unclear,
+    vector_environment,
+    vectors,
+    wrapped,
+)
 
 PAGE = "see the page on environments"
 """Where the forms of environments are explained."""
-
-# Beyond it a bound is none: some packages write the largest float for infinity.
-_LARGEST_BOUND = 1e9
 
 
 class SingleEnv(Protocol):
@@ -56,6 +64,9 @@ class SingleEnv(Protocol):
     def simulation(self) -> Any:
         """What has MuJoCo's ``model`` and ``data``, where it is one of Gymnasium's."""
 
+    def innermost(self) -> Any:
+        """The environment, without what is around it."""
+
     def outcome(self) -> Outcome | None:
         """Reward and termination as functions of the observation, where they are known."""
 
@@ -63,17 +74,63 @@ class SingleEnv(Protocol):
         """Free what it holds."""
 
 
-class SingleGymnasiumEnv:
+class _Single:
+    """What both have in common; deep copies continue where the original is, with its plant."""
+
+    env: Any
+
+    def simulation(self) -> Any:
+        """See :class:`SingleEnv`."""
+        return simulation_of(self.env)
+
+    def innermost(self) -> Any:
+        """See :class:`SingleEnv`."""
+        return innermost(self.env)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _Single:
+        try:
+            for layer in self._made_anew():
+                _copied(layer, memo)
+            copied: _Single = _copied(self, memo)
+        except TypeError as error:
+            raise TypeError(self._cannot_be("copied", str(error))) from error
+        return copied
+
+    def __getstate__(self) -> dict[str, Any]:
+        if self._made_anew():
+            raise TypeError(self._cannot_be("pickled", "gymnasium.utils.EzPickle makes it anew"))
+        return self.__dict__
+
+    def _made_anew(self) -> list[Any]:
+        """Environment and wrappers that usual copies leave without their state, inmost first."""
+        layer = wrapped(self.env)
+        found: list[Any] = []
+        while isinstance(layer, gymnasium.Env):
+            if getattr(type(layer), "__getstate__", None) is EzPickle.__getstate__:
+                found.insert(0, layer)
+            layer = layer.env if isinstance(layer, gymnasium.Wrapper) else None
+        return found
+
+    def _cannot_be(self, done: str, why: str) -> str:
+        name = type(self.innermost()).__name__
+        return f"{name} cannot be {done} with its state ({why}): make another one"
+
+
+class SingleGymnasiumEnv(_Single):
     """An environment of Gymnasium, without TorchRL between."""
 
-    def __init__(self, env: gymnasium.Env[Any, Any], name: str, keys: Sequence[str]) -> None:
-        self.env, self._name, self._keys = env, name, tuple(keys)
-        space = env.action_space
+    def __init__(
+        self, env: gymnasium.Env[Any, Any] | GymWrapper, name: str, keys: Sequence[str]
+    ) -> None:
+        # A wrapper that is let go closes what is in it.
+        self._owner, self._name, self._keys = env, name, tuple(keys)
+        self.env: gymnasium.Env[Any, Any] = env._env if isinstance(env, GymWrapper) else env
+        space = self.env.action_space
         if not isinstance(space, Box) or not np.issubdtype(space.dtype, np.floating):
             raise ValueError(_no_actions(name, space))
         if len(space.shape) != 1:
             raise ValueError(_no_actions(name, f"an array of the shape {space.shape}"))
-        self._type = space.dtype
+        self._space = space
         self.low, self.high = _checked_bounds(name, space.low, space.high)
         self.observation_dim = self._read_observation_space()
 
@@ -81,20 +138,18 @@ class SingleGymnasiumEnv:
         space, name = self.env.observation_space, self._name
         if not isinstance(space, Dict):
             check_keys(self._keys, (), name)
-            if not isinstance(space, Box) or len(space.shape) != 1:
+            if not _is_vector(space) or not space.shape:
                 images = isinstance(space, Box) and len(space.shape) > 1
                 raise ValueError(
                     f"{name} has {'images or tables' if images else space} as observations; a "
-                    f"vector of numbers is needed ({PAGE})"
+                    "vector of floating-point numbers is needed, which "
+                    f"gymnasium.wrappers.DtypeObservation makes of whole numbers ({PAGE})"
                 )
             return int(space.shape[0])
-        parts = {
-            key: part
-            for key, part in space.spaces.items()
-            if isinstance(part, Box) and len(part.shape) <= 1
-        }
+        parts = {key: part for key, part in space.spaces.items() if _is_vector(part)}
         check_keys(self._keys, parts, name)
-        self._keys = self._keys or _whole(name, list(parts))
+        left_out = [key for key in space.spaces if key not in parts]
+        self._keys = self._keys or _whole(name, list(parts), left_out)
         return sum(int(np.prod(parts[key].shape)) for key in self._keys)
 
     def _observed(self, observation: Any) -> np.ndarray:
@@ -123,24 +178,21 @@ class SingleGymnasiumEnv:
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
         """See :class:`SingleEnv`."""
-        stepped = self._parts("step", self.env.step(action.astype(self._type)), 5)
+        space = self._space
+        # Rounded to single precision, a bound may lie beyond itself.
+        within = np.clip(action.astype(space.dtype), space.low, space.high)
+        stepped = self._parts("step", self.env.step(within), 5)
         observation, reward, terminated, truncated, _ = stepped
-        # Some give an array with one number.
-        earned = np.asarray(reward, dtype=np.float64).item()
+        earned = _number(self._name, reward)
         return self._observed(observation), earned, bool(terminated), bool(truncated)
 
     def time_step(self) -> float | None:
         """See :class:`SingleEnv`."""
-        return time_step(GymWrapper(self.env))
+        return time_step(self.env)
 
     def horizon(self) -> int | None:
         """See :class:`SingleEnv`."""
         return _time_limit(self.env)
-
-    def simulation(self) -> Any:
-        """See :class:`SingleEnv`."""
-        inner: Any = self.env.unwrapped
-        return inner if isinstance(getattr(inner, "model", None), mujoco.MjModel) else None
 
     def outcome(self) -> Outcome | None:
         """See :class:`SingleEnv`."""
@@ -148,10 +200,10 @@ class SingleGymnasiumEnv:
 
     def close(self) -> None:
         """See :class:`SingleEnv`."""
-        self.env.close()
+        self._owner.close()
 
 
-class SingleTorchRLEnv:
+class SingleTorchRLEnv(_Single):
     """An environment of TorchRL."""
 
     def __init__(self, env: EnvBase, name: str, keys: Sequence[str]) -> None:
@@ -160,9 +212,12 @@ class SingleTorchRLEnv:
                 f"{name} is a batch of {tuple(env.batch_size)} environments; let it return a "
                 "single one, which is made as often as it is needed"
             )
+        self._name = name
         parts = vectors(env)
         if not keys and "observation" in parts:
-            keys = ("observation",) if len(parts) == 1 else _whole(name, list(parts))
+            left_out = parts_left_out(env, parts)
+            is_whole = len(parts) == 1 and not left_out
+            keys = ("observation",) if is_whole else _whole(name, list(parts), left_out)
         try:
             self.env = vector_environment(env, keys)
         except ValueError as error:
@@ -194,7 +249,7 @@ class SingleTorchRLEnv:
         terminated = stepped.get("terminated", None)
         over = ended and not late if terminated is None else bool(terminated.any())
         late = late or (ended and not over)
-        return self._observed(stepped), float(stepped["reward"].sum()), over, late
+        return self._observed(stepped), _number(self._name, stepped["reward"]), over, late
 
     def _observed(self, data: TensorDictBase) -> np.ndarray:
         observation: np.ndarray = data["observation"].reshape(-1).float().numpy().copy()
@@ -228,10 +283,6 @@ class SingleTorchRLEnv:
             limits += [_in_steps(limit, skipped) for limit in told]
         return min((limit for limit in limits if _is_limit(limit)), default=None)
 
-    def simulation(self) -> Any:
-        """See :class:`SingleEnv`."""
-        return simulation_of(self.env)
-
     def outcome(self) -> Outcome | None:
         """See :class:`SingleEnv`."""
         return None
@@ -239,6 +290,24 @@ class SingleTorchRLEnv:
     def close(self) -> None:
         """See :class:`SingleEnv`."""
         self.env.close(raise_if_closed=False)
+
+
+def _number(name: str, reward: Any) -> float:
+    """A reward, which some give as an array with one number."""
+    earned = np.asarray(reward, dtype=np.float64)
+    if earned.size != 1:
+        raise ValueError(
+            f"{name} returned a reward of shape {earned.shape}; one number is needed: sum them, or "
+            "choose one, in a wrapper or transform"
+        )
+    return earned.item()
+
+
+def _copied(original: Any, memo: dict[int, Any]) -> Any:
+    """A deep copy by attributes."""
+    copied = memo[id(original)] = object.__new__(type(original))
+    copied.__dict__.update(deepcopy(original.__dict__, memo))
+    return copied
 
 
 def _is_limit(limit: object) -> bool:
@@ -278,19 +347,28 @@ def _unbounded(name: str, found: str) -> str:
 
 def _checked_bounds(name: str, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     low, high = low.astype(np.float32), high.astype(np.float32)
-    if not (np.abs(low) < _LARGEST_BOUND).all() or not (np.abs(high) < _LARGEST_BOUND).all():
+    if not (np.abs(low) < LARGEST_BOUND).all() or not (np.abs(high) < LARGEST_BOUND).all():
         raise ValueError(_unbounded(name, f"{low.tolist()} to {high.tolist()}"))
     if not (low < high).all():
         raise ValueError(f"{name} has empty action bounds: {low.tolist()} to {high.tolist()}")
     return low, high
 
 
-def _whole(name: str, parts: Sequence[str]) -> tuple[str, ...]:
+def _is_vector(space: Space[Any]) -> TypeGuard[Box]:
+    """Whether it is a vector of floating-point numbers, or one such number."""
+    if not isinstance(space, Box) or not np.issubdtype(space.dtype, np.floating):
+        return False
+    return len(space.shape) <= 1
+
+
+def _whole(name: str, parts: Sequence[str], left_out: Sequence[str]) -> tuple[str, ...]:
     """All parts of an observation in the order of their names, unless that needs a choice."""
     if not parts:
         raise ValueError(
             f"{name} has no vectors in its observations; a vector of numbers is needed ({PAGE})"
         )
+    if left_out:
+        raise ValueError(f"{name}: {unclear(left_out, parts)} ({PAGE})")
     if "observation" in parts and len(parts) > 1:
         raise ValueError(
             f"{name} has the observations {', '.join(sorted(parts))}: say which make the state, "

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import weakref
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,16 +12,17 @@ from typing import Any, TypeAlias
 import gymnasium
 import mujoco
 import torch
+from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import (
     CatTensors,
     Compose,
     DMControlEnv,
-    DoubleToFloat,
     DTypeCastTransform,
     EnvBase,
     GymEnv,
     GymWrapper,
+    RewardSum,
     SerialEnv,
     Transform,
     TransformedEnv,
@@ -28,6 +30,7 @@ from torchrl.envs import (
 )
 
 from torchrl_l1.control import time_step
+from torchrl_l1.control.pipeline import transforms_of
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
 from torchrl_l1.envs.perturbations import (
     DISTURBANCES,
@@ -42,6 +45,9 @@ from torchrl_l1.envs.tasks import TASKS
 
 MakeEnv: TypeAlias = str | Task | Callable[[], EnvBase]
 """A name, a task of ours, or a function that makes an environment."""
+
+AnyEnv: TypeAlias = EnvBase | gymnasium.Env[Any, Any]
+"""An environment of TorchRL, or one of Gymnasium as it is."""
 
 FORMS = (
     "gymnasium/ID (gymnasium/Pendulum-v1), a task of ours "
@@ -99,8 +105,17 @@ class EnvironmentSource:
         given = self._checked(disturbances or {})
         if self.task is not None:
             return _simulated(self.task, count, given, control, seed)
-        first = self._changed(given)
-        base = first if first.batch_size else SerialEnv(count, lambda: self._changed(given))
+        base = self._changed(given)
+        if not base.batch_size:
+            seen = weakref.ref(innermost(base))
+
+            def another() -> EnvBase:
+                made = self._changed(given)
+                if innermost(made) is seen():
+                    raise ValueError(the_same(self.name))
+                return made
+
+            base = SerialEnv(count, another)
         return _perturbed(base, given, control, seed)
 
     def single(
@@ -146,6 +161,11 @@ class EnvironmentSource:
     def time_step(self) -> float | None:
         """Time of one environment step in seconds, as far as the environment tells."""
         return self.task.dt if self.task is not None else time_step(self.build())
+
+
+def the_same(name: str) -> str:
+    """That a function keeps what it made, with the remedy."""
+    return f"{name or 'the function'} returns the same environment twice: let it make a new one"
 
 
 def _simulated(
@@ -292,7 +312,7 @@ def vector_environment(env: EnvBase, keys: Sequence[str] = ()) -> EnvBase:
     """An environment with a vector ``observation`` and a vector ``action``, both float32.
 
     Where the observation comes in parts, as dm_control's does, they are joined in the order of
-    their names.
+    their names. Actions are clipped to their bounds, as an actuator would, but for our own tasks.
 
     Args:
         env: the environment.
@@ -327,18 +347,40 @@ def vector_environment(env: EnvBase, keys: Sequence[str] = ()) -> EnvBase:
                 f"{type(env).__name__} has no vector of floating-point observations, only "
                 f"{sorted(map(str, env.full_observation_spec.keys(True, True)))}"
             )
+        if not keys and (left_out := parts_left_out(env, found)):
+            raise ValueError(unclear(left_out, found))
         transforms += _joined(env, list(keys) or sorted(found), found)
-        kinds = {spec.dtype for spec in found.values()}
-        is_double = kinds == {torch.float64}
-    else:
-        is_double = found["observation"].dtype == torch.float64
-    double = {
-        "in_keys": ["observation"] * is_double,
-        "in_keys_inv": ["action"] * (action.dtype == torch.float64),
-    }
-    if any(double.values()):
-        transforms.append(DoubleToFloat(**double))
+    kinds = {spec.dtype for spec in found.values()}
+    kind = kinds.pop() if len(kinds) == 1 else torch.float32
+    is_own = isinstance(_base(env), BatchedMujocoEnv)
+    is_done = is_own or any(isinstance(one, _Executed) for one in transforms_of(env))
+    if not is_done or kind != torch.float32:
+        transforms.append(_Observed(kind))
+    if not is_done or action.dtype != torch.float32:
+        transforms.append(_Executed(action, isinstance(action, Bounded) and not is_own))
     return TransformedEnv(env, Compose(*transforms), auto_unwrap=True) if transforms else env
+
+
+class _Observed(DTypeCastTransform):
+    """In single precision, and a copy: some environments write all to the same array."""
+
+    def __init__(self, dtype: torch.dtype) -> None:
+        super().__init__(dtype, torch.float32, in_keys=["observation"])
+
+    def _apply_transform(self, obs: Tensor) -> Tensor:
+        return obs.to(self.dtype_out, copy=True)
+
+
+class _Executed(DTypeCastTransform):
+    """In the environment's type and within its bounds, where rounded ones may not lie either."""
+
+    def __init__(self, spec: TensorSpec, is_clipped: bool) -> None:
+        super().__init__(spec.dtype, torch.float32, in_keys=[], in_keys_inv=["action"])
+        self._space = spec.space if is_clipped else None
+
+    def _inv_apply_transform(self, state: Tensor) -> Tensor:
+        action = state.to(self.dtype_in)
+        return action if self._space is None else action.clamp(self._space.low, self._space.high)
 
 
 def _joined(
@@ -381,19 +423,63 @@ def check_keys(keys: Sequence[str], there: Sequence[str] | Mapping[str, Any], na
 
 
 def vectors(env: EnvBase) -> dict[str, TensorSpec]:
-    """Floating-point observations that are vectors, or numbers, and not nested."""
+    """Floating-point observations that are vectors, or numbers, and not nested.
+
+    Rewards that a transform sums up are none.
+    """
     dims = len(env.batch_size)
+    sums = {
+        key
+        for transform in transforms_of(env)
+        if isinstance(transform, RewardSum)
+        for key in transform.out_keys
+    }
     return {
         key: spec
         for key, spec in env.full_observation_spec.items(True, True)
-        if isinstance(key, str) and spec.dtype.is_floating_point and spec.ndim - dims <= 1
+        if isinstance(key, str)
+        and spec.dtype.is_floating_point
+        and spec.ndim - dims <= 1
+        and key not in sums
     }
 
 
-def simulation_of(env: EnvBase) -> Any:
-    """Gymnasium's environment with MuJoCo's ``model`` and ``data``, if it is one; else ``None``."""
+def parts_left_out(env: EnvBase, found: Mapping[str, TensorSpec]) -> list[str]:
+    """Parts of a dictionary of Gymnasium's that are none of the vectors found."""
+    space = getattr(wrapped(env), "observation_space", None)
+    there = env.full_observation_spec.keys()
+    parts = space if isinstance(space, gymnasium.spaces.Dict) else ()
+    return [key for key in parts if key in there and key not in found]
+
+
+def unclear(left_out: Sequence[str], found: Iterable[str]) -> str:
+    """That the parts which are vectors may not be all that there is to know."""
+    return (
+        f"the observations {', '.join(left_out)} are no vectors of floating-point numbers: say "
+        f"which others make the state, such as observation_keys=[{','.join(sorted(found))}], or "
+        "leave them out by gymnasium.wrappers.FilterObservation"
+    )
+
+
+def innermost(env: AnyEnv) -> Any:
+    """An environment without transforms and wrappers, as its library has it."""
+    inner = wrapped(env)
+    return _base(env) if inner is None else getattr(inner, "unwrapped", inner)
+
+
+def wrapped(env: AnyEnv) -> Any:
+    """What TorchRL wraps, or one of Gymnasium's itself; ``None`` if there is nothing wrapped."""
+    # Not getattr, by which a batch asks its members.
+    return env if isinstance(env, gymnasium.Env) else _base(env).__dict__.get("_env")
+
+
+def _base(env: AnyEnv) -> AnyEnv:
     while isinstance(env, TransformedEnv):
         env = env.base_env
-    # Not getattr, by which a batch asks its members.
-    inner = getattr(env.__dict__.get("_env"), "unwrapped", None)
+    return env
+
+
+def simulation_of(env: AnyEnv) -> Any:
+    """Gymnasium's environment with MuJoCo's ``model`` and ``data``, if it is one; else ``None``."""
+    inner = getattr(wrapped(env), "unwrapped", None)
     return inner if isinstance(getattr(inner, "model", None), mujoco.MjModel) else None

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torchrl_l1.algorithms.collection import Collection, episode_returns
 from torchrl_l1.envs import AnyTask, Perturbation, action_bounds
-from torchrl_l1.experiment.datasets import Episode, split_episodes
+from torchrl_l1.experiment.episodes import Episode, split_episodes
 from torchrl_l1.experiment.evaluate import TrainedRun
 
 QUALITIES = ("random", "medium", "expert")

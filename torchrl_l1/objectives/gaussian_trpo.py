@@ -59,7 +59,7 @@ def gaussian_trpo_step(
 
     Raises:
         NonFiniteAdvantages: if the advantages are not finite.
-        ValueError: if the network is of another kind, or a parameter is frozen.
+        ValueError: if the network is of another kind, a parameter is frozen, or shapes do not fit.
 
     Examples:
         >>> import torch
@@ -99,6 +99,18 @@ class _GaussianProblem:
         config: TRPOConfig,
     ) -> None:
         layers = [layer for layer in mean if isinstance(layer, nn.Linear)]
+        rows, n, m = inputs.shape[0], layers[0].in_features, layers[-1].out_features
+        for name, value, expected in (
+            ("inputs", inputs, (rows, n)),
+            ("action", action, (rows, m)),
+            ("advantage", advantage, (rows, 1)),
+            ("log_std", log_std, (m,)),
+        ):
+            if value.shape != expected:
+                raise ValueError(
+                    f"gaussian_trpo_step: {name} has shape {tuple(value.shape)}, expected "
+                    f"{expected} for this network and these inputs"
+                )
         self.weights = [layer.weight.detach() for layer in layers]
         self.biases = [layer.bias.detach() for layer in layers]
         self.log_std = log_std.detach()

@@ -76,14 +76,13 @@ def conjugate_gradient(
         b: right-hand side ``(d,)``.
         iterations: at most this many products with ``A``.
         tolerance: stop once the squared residual falls to it, or to this share of that of ``b``
-            where ``b`` itself is as small.
+            where ``b`` is shorter than one.
     """
     x = torch.zeros_like(b)
     residual = b.clone()
     direction = b.clone()
     squared = residual @ residual
-    if squared < tolerance:
-        tolerance = tolerance * squared.item()
+    tolerance = tolerance * min(1.0, squared.item())
     for _ in range(iterations):
         if squared <= tolerance:
             break
@@ -131,14 +130,21 @@ def trpo_step(
 
     Args:
         actor: stochastic policy with a closed-form KL divergence, e.g. Gaussian.
-        data: samples ``[B]`` with ``observation`` (whatever the actor reads), ``action`` and
-            ``advantage`` ``(B, 1)``.
+        data: samples of any batch size, ``[B]`` or ``[N, T]``, with ``observation`` (whatever the
+            actor reads), ``action`` and ``advantage`` ``(..., 1)``.
         config: see :class:`TRPOConfig`.
 
     Raises:
+        KeyError: if there is no ``action`` or ``advantage``.
         NonFiniteAdvantages: if the advantages are not finite.
-        ValueError: if there is not one density per sample.
+        ValueError: if there is not one density per sample, or all of the actor is frozen.
     """
+    for key in ("action", "advantage"):
+        if data.get(key, None) is None:
+            raise KeyError(
+                f"TRPO found no {key!r} in the data, only {sorted(map(str, data.keys()))}: rename "
+                "what stands for it"
+            )
     return take_step(_AutogradProblem(actor, data, config), data["advantage"], config)
 
 
@@ -201,9 +207,12 @@ class _AutogradProblem:
     def __init__(
         self, actor: ProbabilisticTensorDictSequential, data: TensorDictBase, config: TRPOConfig
     ) -> None:
-        data = data.detach()  # how samples were drawn is no part of the surrogate
+        # How samples were drawn is no part of the surrogate. In one row, of which some are taken.
+        data = data.detach().reshape(-1)
         self.actor, self.data, self.config = actor, data, config
         self.parameters = [p for p in actor.parameters() if p.requires_grad]
+        if not self.parameters:
+            raise ValueError("TRPO: all parameters of the actor are frozen, so nothing can change")
         with torch.no_grad():
             self.old = actor.get_dist(data)
             self.old_log_prob = self.old.log_prob(data["action"])
@@ -217,10 +226,12 @@ class _AutogradProblem:
             self.before = self._surrogate(self.old)
         self._divergence_gradient: Tensor | None = None
 
+    @torch.enable_grad()
     def gradient(self) -> Tensor:
         surrogate = self._surrogate(self.actor.get_dist(self.data))
         return _flat_gradient(surrogate, self.parameters).detach()
 
+    @torch.enable_grad()
     def fisher_product(self, vector: Tensor) -> Tensor:
         """The Hessian of the mean KL divergence, on some of the samples."""
         if self._divergence_gradient is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -11,12 +12,11 @@ from torchrl_l1.checks import check_counts, check_not_negative, check_positive, 
 from torchrl_l1.planning.sequences import (
     Evaluate,
     Plan,
-    checked_bounds,
     checked_mean,
     evaluated,
     initial_variance,
     keep_best,
-    sample_around,
+    planning_bounds,
     select,
 )
 
@@ -36,7 +36,7 @@ class CEMConfig:
         initial_variance: of the actions, action units squared; ``None`` for the square of a
             quarter of each action's range.
         minimum_variance: an environment whose variances are all at most this is done after an
-            iteration; 0 lets all iterations run.
+            iteration, action units squared; 0 lets all iterations run.
         return_best: execute the best sequence ever drawn instead of the final mean.
     """
 
@@ -51,9 +51,10 @@ class CEMConfig:
 
     def __post_init__(self) -> None:
         check_counts(self, "horizon", "candidates", "elites", "iterations", prefix="cem.")
-        if self.elites > self.candidates:
+        if self.elites >= self.candidates:
             raise ValueError(
-                f"cem.elites ({self.elites}) must not exceed cem.candidates ({self.candidates})"
+                f"cem.elites ({self.elites}) must be fewer than cem.candidates "
+                f"({self.candidates}), or returns decide nothing"
             )
         # At 1 nothing would ever be learnt.
         check_within("cem.momentum", self.momentum, "[0, 1)")
@@ -86,7 +87,7 @@ def plan(
 
     Raises:
         ValueError: for bounds that are empty, infinite or of the wrong width, a mean or returns
-            of the wrong shape.
+            of the wrong shape, or a ``minimum_variance`` that the first iteration falls below.
 
     Examples:
         >>> target = torch.tensor([0.5, -0.25])
@@ -101,14 +102,23 @@ def plan(
         >>> result.actions[0, 0].round(decimals=2)
         tensor([ 0.5000, -0.2500])
     """
-    low, high = checked_bounds(low, high, mean)
+    low, high = planning_bounds(low, high, mean)
     mean = checked_mean(mean, config.horizon, low, high)
     variance = initial_variance(config.initial_variance, low, high, mean)
+    widest = variance.max().item()
+    if config.iterations > 1 and not config.minimum_variance < widest:
+        raise ValueError(
+            f"cem.minimum_variance ({config.minimum_variance:g}) must be below the variance that "
+            f"plans start from ({widest:g}), or all of them end after one iteration: scale it with "
+            "the square of the action's range"
+        )
     best, best_return = mean, torch.full_like(mean[:, 0, 0], -torch.inf)
     unfinished = torch.ones_like(best_return, dtype=torch.bool)
     for _ in range(config.iterations):
         sequences = sample_around(mean, variance, low, high, config.candidates, generator)
         returns = evaluated(evaluate, sequences)
+        # What others of the batch still need is not to change the plan of one that is done.
+        returns = torch.where(unfinished[:, None], returns, -torch.inf)
         best, best_return = keep_best(best, best_return, sequences, returns)
         values, index = returns.topk(config.elites, dim=1)
         finite = torch.isfinite(values)
@@ -120,8 +130,34 @@ def plan(
         unfinished = unfinished & (variance.amax((1, 2)) > config.minimum_variance)
         if not unfinished.any():
             break
+    # Rounding of the momentum's sum may step over a bound.
+    mean = torch.minimum(torch.maximum(mean, low), high)
     actions = best if config.return_best else mean
     return Plan(actions, mean, variance, best, best_return)
+
+
+def sample_around(
+    mean: Tensor,
+    variance: Tensor,
+    low: Tensor,
+    high: Tensor,
+    candidates: int,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Sequences ``(N, C, H, m)`` around a mean ``(N, H, m)``, all within the bounds.
+
+    Normal, truncated at two standard deviations, which are first narrowed until they fit
+    between the mean and the nearer bound (as in the code of arXiv 1805.12114). The variance of
+    a sample is therefore 0.774 of the one given, or less.
+    """
+    room = torch.minimum(mean - low, high - mean).clamp_min(0) / 2
+    std = torch.minimum(variance.sqrt(), room).unsqueeze(1)
+    shape = (mean.shape[0], candidates, *mean.shape[1:])
+    # The inverse of the distribution function; P(|z| < 2) = erf(sqrt 2).
+    uniform = torch.rand(shape, dtype=mean.dtype, device=mean.device, generator=generator)
+    normal = uniform.mul_(2).sub_(1).mul_(math.erf(math.sqrt(2))).erfinv_().mul_(math.sqrt(2))
+    sequences = torch.addcmul(mean.unsqueeze(1), std, normal)
+    return torch.minimum(torch.maximum(sequences, low), high)
 
 
 def _moments(elites: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:

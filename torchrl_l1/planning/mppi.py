@@ -11,12 +11,11 @@ from torchrl_l1.checks import check_counts, check_positive
 from torchrl_l1.planning.sequences import (
     Evaluate,
     Plan,
-    checked_bounds,
     checked_mean,
     evaluated,
     initial_variance,
     keep_best,
-    sample_around,
+    planning_bounds,
 )
 
 
@@ -29,8 +28,8 @@ class MPPIConfig:
         candidates: sequences drawn per iteration and environment, C.
         iterations: rounds of drawing and averaging.
         temperature: difference in return by which a sequence's weight falls to 1/e.
-        variance: of the actions drawn, action units squared; ``None`` for the square of a
-            quarter of each action's range.
+        variance: of the actions before they are clipped, action units squared; ``None`` for the
+            square of a quarter of each action's range.
         return_best: execute the best sequence ever drawn instead of the final mean.
     """
 
@@ -59,9 +58,9 @@ def plan(
 ) -> Plan:
     r"""Move the mean to the average of sequences weighted by :math:`e^{R / \lambda}`.
 
-    The information-theoretic update of arXiv 1707.02342 without its control cost, on samples
-    that respect the bounds as those of :func:`torchrl_l1.planning.cem.plan`, whose arguments and
-    errors these are. Sequences whose return is not finite weigh nothing.
+    The information-theoretic update of arXiv 1707.02342 without its control cost, on normal
+    samples that are clipped to the bounds. Arguments and errors are those of
+    :func:`torchrl_l1.planning.cem.plan`. Sequences whose return is not finite weigh nothing.
 
     Examples:
         >>> result = plan(
@@ -75,12 +74,16 @@ def plan(
         >>> result.actions.sub(0.5).abs().max() < 0.05
         tensor(True)
     """
-    low, high = checked_bounds(low, high, mean)
+    low, high = planning_bounds(low, high, mean)
     mean = checked_mean(mean, config.horizon, low, high)
     variance = initial_variance(config.variance, low, high, mean)
+    std = variance.sqrt().unsqueeze(1)
+    shape = (mean.shape[0], config.candidates, *mean.shape[1:])
     best, best_return = mean, torch.full_like(mean[:, 0, 0], -torch.inf)
     for _ in range(config.iterations):
-        sequences = sample_around(mean, variance, low, high, config.candidates, generator)
+        normal = torch.randn(shape, dtype=mean.dtype, device=mean.device, generator=generator)
+        sequences = torch.addcmul(mean.unsqueeze(1), std, normal)
+        sequences = torch.minimum(torch.maximum(sequences, low), high)
         returns = evaluated(evaluate, sequences)
         best, best_return = keep_best(best, best_return, sequences, returns)
         highest = returns.amax(1, keepdim=True)

@@ -13,11 +13,12 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
+from torchrl_l1.checks import check_count
 from torchrl_l1.planning import cem, mppi, random_shooting
 from torchrl_l1.planning.cem import CEMConfig
 from torchrl_l1.planning.mppi import MPPIConfig
 from torchrl_l1.planning.random_shooting import ShootingConfig
-from torchrl_l1.planning.sequences import Plan, SequenceOptimizer, checked_bounds
+from torchrl_l1.planning.sequences import Plan, SequenceOptimizer, planning_bounds
 from torchrl_l1.planning.trajectory_sampling import TrajectorySampler
 
 OptimizerConfig = CEMConfig | MPPIConfig | ShootingConfig
@@ -100,7 +101,8 @@ class ModelPredictiveController(TensorDictModuleBase):
         if type(config) not in _OPTIMIZERS:
             names = ", ".join(kind.__name__ for kind in _OPTIMIZERS)
             raise TypeError(f"config must be one of {names}, got {type(config).__name__}")
-        if not 1 <= replan_every <= config.horizon:
+        check_count("replan_every", replan_every)
+        if not replan_every <= config.horizon:
             raise ValueError(
                 f"replan_every must be between 1 and the horizon {config.horizon}, got "
                 f"{replan_every}"
@@ -123,7 +125,7 @@ class ModelPredictiveController(TensorDictModuleBase):
         low, high = (
             torch.as_tensor(bound, dtype=zero.dtype) for bound in (action_low, action_high)
         )
-        self.action_low, self.action_high = checked_bounds(low, high, zero)
+        self.action_low, self.action_high = planning_bounds(low, high, zero)
         self._spec = {
             "mean": (zero.shape[1:], torch.float32),
             "step": (torch.Size([1]), torch.int64),
@@ -174,6 +176,8 @@ class ModelPredictiveController(TensorDictModuleBase):
                 f"ModelPredictiveController.plan: start must have shape {shape} for these "
                 f"observations and settings, got {tuple(start.shape)}"
             )
+        if not torch.isfinite(start).all():
+            raise ValueError("ModelPredictiveController.plan: start must be finite")
         optimize, device = _OPTIMIZERS[type(self.config)], dynamics.device
         observation, start = (part.to(device, torch.float32) for part in (observation, start))
         portion = max(1, _PORTION // (self.config.candidates * shape[1] * shape[2]))
@@ -242,14 +246,17 @@ class ModelPredictiveController(TensorDictModuleBase):
         if not failed.any():
             return
         x, u = observation[failed], action[failed]
-        reward = self.sampler.reward(x, u, x)
-        bad = ~torch.isfinite(reward) & torch.isfinite(x).all(-1)
-        if bad.any():
-            raise ValueError(
-                "ModelPredictiveController: the reward function gives "
-                f"{reward[bad][0].item()} at the observation {x[bad][0].tolist()} with the action "
-                f"{u[bad][0].tolist()}; planning needs rewards that are finite"
-            )
+        for successor in (x, x + self.sampler.dynamics.mean_change(x, u)):
+            reward = self.sampler.reward(x, u, successor)
+            finite = torch.isfinite(x).all(-1) & torch.isfinite(successor).all(-1)
+            bad = ~torch.isfinite(reward) & finite
+            if bad.any():
+                raise ValueError(
+                    "ModelPredictiveController: the reward function gives "
+                    f"{reward[bad][0].item()} at the observation {x[bad][0].tolist()} with the "
+                    f"action {u[bad][0].tolist()} and the next observation "
+                    f"{successor[bad][0].tolist()}; planning needs rewards that are finite"
+                )
 
     def _observation(self, tensordict: TensorDictBase) -> Tensor:
         observation = tensordict.get(self.observation_key, None)

@@ -11,10 +11,10 @@ from torchrl_l1.checks import check_counts
 from torchrl_l1.planning.sequences import (
     Evaluate,
     Plan,
-    checked_bounds,
     checked_mean,
     evaluated,
     keep_best,
+    planning_bounds,
 )
 
 
@@ -35,6 +35,10 @@ class ShootingConfig:
 
     def __post_init__(self) -> None:
         check_counts(self, "horizon", "candidates", prefix="shooting.")
+        if self.warm_start and self.candidates == 1:
+            raise ValueError(
+                "shooting.candidates must be at least 2 with a warm start, which is the first"
+            )
 
 
 @torch.no_grad()
@@ -63,7 +67,7 @@ def plan(
         >>> result.actions.sub(0.5).abs().max() < 0.01
         tensor(True)
     """
-    low, high = checked_bounds(low, high, mean)
+    low, high = planning_bounds(low, high, mean)
     mean = checked_mean(mean, config.horizon, low, high)
     shape = (mean.shape[0], config.candidates, *mean.shape[1:])
     uniform = torch.rand(shape, dtype=mean.dtype, device=mean.device, generator=generator)

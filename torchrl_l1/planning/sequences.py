@@ -1,15 +1,15 @@
-"""What the optimisers of action sequences share: their contract, checks of arguments, sampling."""
+"""What the optimisers of action sequences share: their contract and checks of arguments."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
-from torchrl_l1.dynamics.imagination import untouched
+from torchrl_l1.checks import LARGEST_BOUND
+from torchrl_l1.dynamics.imagination import checked_bounds, untouched
 
 Evaluate = Callable[[Tensor], Tensor]
 """Returns ``(N, C)`` of candidate action sequences ``(N, C, H, m)``."""
@@ -51,7 +51,7 @@ class SequenceOptimizer(Protocol):
         """See :func:`torchrl_l1.planning.cem.plan`."""
 
 
-def checked_bounds(
+def planning_bounds(
     low: Tensor | float, high: Tensor | float, mean: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Action bounds as ``(m,)``, in type and place those of the mean.
@@ -59,23 +59,14 @@ def checked_bounds(
     Raises:
         ValueError: if they are of another width, not finite, or leave no action between them.
     """
-    width = mean.shape[-1]
-    bounds = []
+    low, high = checked_bounds(low, high, mean)
     for name, bound in (("low", low), ("high", high)):
-        tensor = torch.as_tensor(bound, dtype=mean.dtype, device=mean.device)
-        if tensor.dim() > 1 or tensor.numel() not in (1, width):
+        if not (bound.abs() < LARGEST_BOUND).all():
             raise ValueError(
-                f"the action bound {name} has shape {tuple(tensor.shape)}, expected ({width},)"
+                f"the action bound {name} must be finite, got {bound.tolist()}: give numbers "
+                "between which to look for actions"
             )
-        if not torch.isfinite(tensor).all():
-            raise ValueError(f"the action bound {name} must be finite, got {tensor.tolist()}")
-        bounds.append(tensor.expand(width))
-    if (bounds[0] >= bounds[1]).any():
-        raise ValueError(
-            "the action bounds are empty: low must be below high, got "
-            f"{bounds[0].tolist()} and {bounds[1].tolist()}"
-        )
-    return bounds[0], bounds[1]
+    return low, high
 
 
 def checked_mean(mean: Tensor, horizon: int, low: Tensor, high: Tensor) -> Tensor:
@@ -123,30 +114,6 @@ def keep_best(
         torch.where(better[:, None, None], champion, best),
         torch.where(better, value, best_return),
     )
-
-
-def sample_around(
-    mean: Tensor,
-    variance: Tensor,
-    low: Tensor,
-    high: Tensor,
-    candidates: int,
-    generator: torch.Generator | None = None,
-) -> Tensor:
-    """Sequences ``(N, C, H, m)`` around a mean ``(N, H, m)``, all within the bounds.
-
-    Normal, truncated at two standard deviations, which are first narrowed until they fit
-    between the mean and the nearer bound (as in the code of arXiv 1805.12114). The variance of
-    a sample is therefore 0.774 of the one given, or less.
-    """
-    room = torch.minimum(mean - low, high - mean).clamp_min(0) / 2
-    std = torch.minimum(variance.sqrt(), room).unsqueeze(1)
-    shape = (mean.shape[0], candidates, *mean.shape[1:])
-    # The inverse of the distribution function; P(|z| < 2) = erf(sqrt 2).
-    uniform = torch.rand(shape, dtype=mean.dtype, device=mean.device, generator=generator)
-    normal = uniform.mul_(2).sub_(1).mul_(math.erf(math.sqrt(2))).erfinv_().mul_(math.sqrt(2))
-    sequences = torch.addcmul(mean.unsqueeze(1), std, normal)
-    return torch.minimum(torch.maximum(sequences, low), high)
 
 
 def initial_variance(given: float | None, low: Tensor, high: Tensor, like: Tensor) -> Tensor:

@@ -1,0 +1,150 @@
+"""What the scripts of the studies make of the files that they read."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from scipy.stats import ttest_1samp
+
+from tests.test_studies import RESULTS, script
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """Figures that would have been saved."""
+    figures: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
+    return figures
+
+
+def test_the_sample_of_the_suite_is_its_resets(monkeypatch: pytest.MonkeyPatch) -> None:
+    suite = script("suite", monkeypatch)
+    rng = np.random.default_rng(0)
+    undisturbed, off, on = (rng.normal(mean, 1.0, 8) for mean in (10.0, 4.0, 8.0))
+    # A second value at which the same comes of each reset says nothing new.
+    cells = [("bias", 1.0), ("bias", 2.0)]
+    returns = {("seed_0", "off", suite.NONE): undisturbed}
+    for cell in cells:
+        returns |= {("seed_0", "off", cell): off, ("seed_0", "robust", cell): on}
+    mean, interval = suite.change(returns, "robust", cells)
+    shares = (on - off) / undisturbed.mean()
+    expected = ttest_1samp(shares, 0.0).confidence_interval()
+    found = [mean, interval.low, interval.high]
+    np.testing.assert_allclose(found, [shares.mean(), expected.low, expected.high])
+    loss = undisturbed - off
+    share, ends = suite.regained(returns, "robust", cells)
+    assert share == pytest.approx((on - off).mean() / loss.mean())
+    for end in (ends.low, ends.high):
+        assert ttest_1samp(on - off - end * loss, 0.0).pvalue == pytest.approx(0.05)
+
+
+def test_figure_of_the_suite_says_what_lies_beyond_its_colours(
+    drawn: list[Figure], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite = script("suite", monkeypatch)
+    suite.plot({"walker": suite.read("walker")}, tmp_path / "verdicts.png")
+    images = [axis.images[0] for axis in drawn[0].axes[:2]]
+    assert min(image.get_array().min() for image in images) < images[-1].norm.vmin
+    assert images[-1].colorbar.extend == "both"
+
+
+def test_no_model_lies_outside_the_figure(
+    drawn: list[Figure], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fit_quality = script("fit_quality", monkeypatch)
+    with (RESULTS / "fit_quality/runs.csv").open(newline="") as handle:
+        fit_quality.draw(list(csv.DictReader(handle)), tmp_path / "quality.png")
+    for axis in drawn[0].axes:
+        low, high = axis.get_xlim()
+        for line in axis.lines[:2]:
+            assert low < min(line.get_xdata()) and max(line.get_xdata()) < high
+
+
+def test_returns_of_either_sign_do_not_shrink_what_harm_is_measured_by(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    robust = script("robust", monkeypatch)
+    returns = {"good": {"off": 100.0, "paper": 80.0}, "bad": {"off": -60.0, "paper": -60.0}}
+    episodes = [
+        {"run": run, "l1": l1, "noise": "none", "bias": 0.0, "signs": 0.0, "return": value}
+        for run, of in returns.items()
+        for l1, value in of.items()
+    ]
+    # -20 and 0, of 100 and 60.
+    assert robust.harm(episodes, "none", "paper", draws=2)["mean"] == "-12.5"
+
+
+def write(file: Path, rows: Sequence[dict[str, Any]]) -> None:
+    file.parent.mkdir(parents=True)
+    with file.open("w", newline="") as handle:
+        writer = csv.DictWriter(handle, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def new_planner(folder: Path) -> tuple[str, str]:
+    controllers = ("off", "paper", "robust", "oracle")
+    rows = [{"l1": l1, "bias": 0.0, "episode": 0, "return": -1.0} for l1 in controllers]
+    write(folder / "pets/episodes.csv", rows)
+    return "planners/episodes.csv", "pets"
+
+
+def new_reward(folder: Path) -> tuple[str, str]:
+    rows = [{"real_steps": 12000, "return_mean": 1.0, "reward_model/explained_variance": 0.5}]
+    write(folder / "learned/seed_0/metrics.csv", rows)
+    return "learned_rewards.csv", "learned,0"
+
+
+@pytest.mark.usefixtures("drawn")
+@pytest.mark.parametrize(
+    ("name", "measure"), [("planners", new_planner), ("learned_rewards", new_reward)]
+)
+def test_what_a_folder_lacks_is_kept(
+    name: str,
+    measure: Callable[[Path], tuple[str, str]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for kept in RESULTS.glob(f"{name}*"):
+        (shutil.copytree if kept.is_dir() else shutil.copy)(kept, tmp_path / kept.name)
+    copied: ModuleType = script(name, monkeypatch, tmp_path)
+    new = tmp_path / "new"
+    file, key = measure(new)
+
+    def lines() -> list[str]:
+        return (tmp_path / file).read_text().splitlines()
+
+    before = lines()
+    monkeypatch.setattr(sys, "argv", [name, str(tmp_path / "mistyped")])
+    with pytest.raises(SystemExit, match="mistyped"):
+        copied.main()
+    assert lines() == before
+    monkeypatch.setattr(sys, "argv", [name, str(new)])
+    copied.main()
+    others = [line for line in before if not line.startswith(key)]
+    assert [line for line in lines() if not line.startswith(key)] == others
+    assert len(others) < len(lines()) < len(before)
+
+
+def test_qualities_that_a_campaign_lacks_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    offline = script("offline", monkeypatch)
+    file = tmp_path / "cells.csv"
+    shutil.copy(RESULTS / "offline/cells.csv", file)
+    before = offline.kept(file)
+    of_run = {"task": "hopper", "quality": "expert", "seed": 0}
+    offline.keep([{**offline.select(before, **of_run)[0], "return": 7.0}], file)
+    after = offline.kept(file)
+    assert [row["return"] for row in offline.select(after, **of_run)] == [7.0]
+    others = [row for row in before if not offline.select([row], **of_run)]
+    assert [row for row in after if not offline.select([row], **of_run)] == others
