@@ -218,7 +218,11 @@ def main() -> None:
             gather(Path(sys.argv[1]), task)
         if (HERE / f"{task}.csv").exists():
             of[task] = read(task)
-    words: dict[str, dict[str, str]] = {}
+    words = {
+        name: {"disturbance": entry.words, "matched": "yes" if entry.matched else ""}
+        for name, entry in DISTURBANCES.items()
+        if any(name in groups_of(returns) for returns in of.values())
+    }
     for task, returns in of.items():
         groups = groups_of(returns)
         kinds = [(DISTURBANCES[name].words, cells) for name, cells in groups.items()]
@@ -227,11 +231,11 @@ def main() -> None:
         (HERE / f"{task}.md").write_text(table(returns, none + kinds) + "\n")
         (HERE / f"{task}_values.md").write_text(table(returns, none + every) + "\n")
         policies = len({key[0] for key in returns})
-        for name, cells in groups.items():
-            line = words.setdefault(name, {"disturbance": DISTURBANCES[name].words})
-            line["matched"] = "yes" if DISTURBANCES[name].matched else ""
-            column = f"{task.replace('_', ' ')} ({policies})"
-            line[column] = " / ".join(verdict(returns, l1, cells) for l1 in ("paper", "robust"))
+        column = f"{task.replace('_', ' ')} ({policies})"
+        for name, line in words.items():
+            cells = groups.get(name)  # none where it cannot act
+            verdicts = [verdict(returns, l1, cells) for l1 in ("paper", "robust") if cells]
+            line[column] = " / ".join(verdicts) or "–"
     (HERE / "verdicts.md").write_text(markdown(list(words.values())) + "\n")
     plot(of, HERE / "verdicts.png")
     print(f"Tables and figure: {HERE}")

@@ -102,6 +102,11 @@ def test_suites_leave_out_what_cannot_act():
     assert "mass" not in takes["Pendulum-v1"] and "bias" in takes["Pendulum-v1"]
 
 
+def test_what_begins_after_the_last_step_gets_a_warning(robust):
+    with pytest.warns(UserWarning, match=r"step does nothing here: .* an episode has 5 steps"):
+        robust.evaluate({"step": 0.3}, episodes=1, most_steps=5, progress=False)
+
+
 @pytest.mark.parametrize("kept", [("bias",), ("bias", "delay")], ids=["lines", "bars"])
 def test_charts(table, tmp_path, kept):
     rows = [row for row in table if "delay" in kept or not row["delay"]]

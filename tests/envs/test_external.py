@@ -179,6 +179,17 @@ def test_steps_that_are_not_finite_end_the_episode_and_are_told():
     assert data["next", "reward"][:, -1].eq(0).all()
 
 
+def test_a_reward_that_single_precision_cannot_hold_is_not_finite():
+    class Rich(Cart):
+        def step(self, action):
+            observation, _, *rest = super().step(action)
+            return observation, 1e39 if self.steps == 2 else 1.0, *rest
+
+    data = task_of(Rich).environment(2, seed=0).rollout(10)
+    assert data["next", "non_finite"][..., 0].tolist() == [[False, True]] * 2
+    assert data["next", "reward"][..., 0].tolist() == [[1.0, 0.0]] * 2
+
+
 def test_actions_beyond_the_bounds_are_clipped():
     env = task_of(Cart).environment(1, seed=0)  # the cart itself takes no others
     state = env.reset()

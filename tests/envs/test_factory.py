@@ -1,11 +1,22 @@
 from __future__ import annotations
 
+import gymnasium
 import pytest
 import torch
 from torchrl.envs import Transform
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_l1.envs import BatchedMujocoEnv, get_task, make_env
+from torchrl_l1.envs import (
+    DISTURBANCES,
+    TASKS,
+    BatchedMujocoEnv,
+    disturbed_model,
+    environment_source,
+    get_task,
+    make_env,
+    suite,
+)
+from torchrl_l1.envs.factory import acting_on, episode_steps
 
 
 class _Controller(Transform):
@@ -107,3 +118,59 @@ def test_settings_of_a_task_go_through():
             get_task(own, **settings)
     with pytest.raises(ValueError, match=r"horizon .* go with a name"):
         get_task(env.base_env.task, horizon=5)
+
+
+@pytest.mark.filterwarnings("ignore:.* does nothing here")
+@pytest.mark.parametrize(
+    ("task", "idle"),
+    [
+        ("inverted_pendulum_unclamped", {"step", "friction", "armature", "softness"}),
+        ("gymnasium/InvertedPendulum-v5", {"step", "friction", "armature", "softness", "wind"}),
+        ("swimmer", {"step", "friction", "damping", "softness"}),
+        ("half_cheetah", {"step"}),
+    ],
+)
+def test_what_is_left_out_changes_no_episode_and_what_is_kept_does(task, idle):
+    def episode(**disturbance):
+        torch.manual_seed(0)
+        env = make_env(task, 1, seed=0, max_steps=40, **disturbance)
+        return env.rollout(40, break_when_any_done=False)["next", "observation"]
+
+    can_act = acting_on(environment_source(task), 40)
+    undisturbed = episode()
+    assert can_act({})
+    found = set()
+    for cell in suite("quick")[1:]:
+        if can_act(cell):
+            assert not torch.equal(episode(**cell), undisturbed), cell
+        else:
+            found |= set(cell)
+            if "wind" not in cell:
+                assert torch.equal(episode(**cell), undisturbed), cell
+    assert found == idle
+
+
+def test_contacts_that_are_as_hard_as_the_time_step_allows():
+    can_act = acting_on(environment_source("half_cheetah"), 40)
+    assert [can_act({"softness": value}) for value in (0.5, 1.5)] == [False, True]
+
+
+def test_steps_of_an_episode_are_those_that_environments_say():
+    assert episode_steps(environment_source("hopper")) == 1000
+    assert episode_steps(environment_source("gymnasium/Reacher-v5")) == 50
+    unlimited = environment_source(lambda: gymnasium.make("Reacher-v5").unwrapped)
+    assert episode_steps(unlimited) == float("inf")
+    can_act = acting_on(environment_source("gymnasium/Reacher-v5"), 50)
+    assert not can_act({"step": 0.3}) and can_act({"bias": 0.3})
+
+
+def test_what_does_nothing_although_it_is_asked_for_gets_a_warning():
+    with pytest.warns(UserWarning, match=r"friction 0.5 does nothing here: the model has no cont"):
+        make_env("swimmer", 2, friction=0.5)
+    with pytest.warns(UserWarning, match=r"step .* begins at step 50, and an episode has 50 steps"):
+        make_env("gymnasium/Reacher-v5", 1, step=0.3)
+    with pytest.warns(UserWarning, match=r"armature 2 does nothing here: .* no inertia of rotors"):
+        environment_source("gymnasium/InvertedPendulum-v5").several(1, {"armature": 2.0})
+    model = TASKS["swimmer"].build_model()
+    plant = {n: e.neutral for n, e in DISTURBANCES.items() if e.acts_on == "plant" and n != "wind"}
+    disturbed_model(model, plant)  # without one

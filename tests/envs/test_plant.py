@@ -111,6 +111,70 @@ def test_payload_slope_and_wind_in_newtons():
     np.testing.assert_allclose(force[force != 0], [-0.1 * 9.81 * total])
 
 
+def test_a_payload_in_a_fluid_leaves_the_drag_as_it_is():
+    task = get_task("swimmer")
+    model = task.build_model()
+    torso = model.body("torso").id
+    denser = 1 + 0.3 * model.body_mass.sum() / model.body_mass[torso]
+
+    def edit(spec):
+        spec.body("torso").geoms[0].density *= denser
+
+    loaded, reference = disturbed_model(model, {"payload": 0.3}), edited("swimmer", edit)
+    for field in ("body_mass", "body_inertia", "dof_M0", "body_subtreemass"):
+        np.testing.assert_allclose(getattr(loaded, field), getattr(reference, field), rtol=1e-9)
+    drags = []
+    for one in (model, loaded):
+        data = mujoco.MjData(one)
+        data.qvel[:] = [0.3, -0.2, 0.5, 0.4, -0.3]
+        mujoco.mj_forward(one, data)
+        drags.append(data.qfrc_passive.copy())
+    np.testing.assert_allclose(*drags, rtol=1e-9)
+    assert abs(drags[0]).min() > 1
+
+
+def test_damping_that_grows_with_the_velocity_is_scaled_as_a_whole():
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><joint type="hinge" axis="0 1 0" damping="1 2"/>
+        <geom size=".1"/></body></worldbody></mujoco>"""
+    )
+    forces = []
+    for one in (model, disturbed_model(model, {"damping": 3.0})):
+        data = mujoco.MjData(one)
+        data.qvel[:] = 2.0
+        mujoco.mj_forward(one, data)
+        forces.append(data.qfrc_passive[0])
+    assert forces[0] < -2.0  # more than its constant part
+    assert forces[1] == pytest.approx(3 * forces[0])
+
+
+def test_friction_of_one_body_is_a_factor_on_its_contacts_or_refused():
+    model = get_task("half_cheetah").build_model()
+    foot = model.geom("bfoot").id
+
+    def friction(changes):
+        one = disturbed_model(model, changes, body="bfoot") if changes else model
+        data = mujoco.MjData(one)
+        data.qpos[1] = -0.15
+        mujoco.mj_forward(one, data)
+        return {
+            tuple(contact.geom): contact.friction[0]
+            for contact in data.contact
+            if foot in contact.geom
+        }
+
+    before = friction({})
+    assert len(before) == 1
+    for factor in (0.5, 0.0):
+        with pytest.raises(
+            ValueError, match=r"friction .* of 'bfoot' alone: a contact has the lar"
+        ):
+            friction({"friction": factor})
+    assert friction({"friction": 2.0}) == {pair: 2 * value for pair, value in before.items()}
+    model.geom_priority[foot] = 1
+    assert friction({"friction": 0.5}) == {pair: value / 2 for pair, value in before.items()}
+
+
 def test_softness_keeps_the_damping_ratio_of_either_format():
     model = get_task("hopper").build_model()
     model.geom_solref[0] = [0.02, 0.7]

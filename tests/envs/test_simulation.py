@@ -17,7 +17,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
 
-from torchrl_l1.envs import TASKS, BatchedMujocoEnv, make_env
+from torchrl_l1.envs import TASKS, BatchedMujocoEnv, get_task, make_env
 
 GYM_IDS = {
     "inverted_pendulum": "InvertedPendulum-v5",
@@ -343,3 +343,61 @@ def test_a_task_may_observe_the_live_positions():
         reward = following["reward"].squeeze(-1)
         torch.testing.assert_close(reward, -before[:, 1].square(), rtol=0, atol=0)
         before = following["observation"]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"observation_dim": 12}, r"observe returns the shape \(3, 11\) .* expected \(3, 12\)"),
+        ({"reward": lambda x, u, y: x[..., :1]}, r"reward returns the shape \(3, 1\)"),
+        ({"terminated": lambda y: y[..., :1] < 0}, r"'own': terminated returns the shape \(3, 1\)"),
+    ],
+)
+def test_functions_of_another_shape_are_named(change, words):
+    with pytest.raises(ValueError, match=words):
+        BatchedMujocoEnv(replace(TASKS["hopper"], name="own", **change), 3, seed=0)
+
+
+@pytest.mark.parametrize("bad", [np.nan, 1e39])
+@pytest.mark.parametrize("where", ["observe", "reward"])
+def test_what_a_task_makes_of_a_state_must_be_finite_too(where, bad):
+    task, steps = TASKS["half_cheetah"], []
+
+    def spoilt(values):
+        return np.where(np.arange(len(values)) == 1, bad, values.T).T if steps == [1] else values
+
+    def observe(*state):
+        found = task.observe(*state)
+        return spoilt(found) if where == "observe" else found
+
+    def reward(*transition):
+        found = task.reward(*transition)
+        return torch.from_numpy(spoilt(found.numpy())) if where == "reward" else found
+
+    env = BatchedMujocoEnv(replace(task, observe=observe, reward=reward), 2, seed=0)
+    before = env.reset()["observation"]
+    steps.append(1)
+    following = _step(env, torch.ones(2, 6))
+    for flag in ("non_finite", "terminated", "done"):
+        assert following[flag][:, 0].tolist() == [False, True]
+    assert torch.equal(following["observation"][1], before[1])
+    assert not torch.equal(following["observation"][0], before[0])
+    assert following["reward"].isfinite().all()
+    steps.clear()
+    assert not _step(env, torch.ones(2, 6))["non_finite"].any()
+
+
+def test_a_restart_by_mujoco_is_no_transition(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where MuJoCo logs what it warns of
+    env = get_task("gymnasium/InvertedPendulum-v5").environment(2, seed=0)
+    data = env.reset()
+    for spoilt in (["qvel"], ["qvel"], ["qpos", "qvel"], []):
+        before = data["observation"]
+        simulated = env.members[1].simulation().data
+        for part in spoilt:  # MuJoCo restarts from the pose of the XML, as often as it takes
+            getattr(simulated, part)[:] = np.nan
+        data = env.step(data.set("action", torch.ones(2, 1)))["next"]
+        assert data["non_finite"][:, 0].tolist() == [False, bool(spoilt)]
+        assert torch.equal(data["observation"][1], before[1]) == bool(spoilt)
+        assert not torch.equal(data["observation"][0], before[0])
+        assert np.isfinite(simulated.qpos).all()

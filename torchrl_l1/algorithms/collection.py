@@ -28,8 +28,8 @@ RETURN_METRICS: dict[str, str] = {
     "return_max": "Highest return among them.",
     "return_deterministic": "Mean return of full real episodes with mean actions.",
     "episodes": "Number of episodes behind `return_mean`.",
-    "non_finite_steps": "Real steps on which the simulator's state became non-finite; they end "
-    "the episode and are kept out of the data.",
+    "non_finite_steps": "Real steps on which the simulator's state, the observation or the reward "
+    "became non-finite; they end the episode and are kept out of the data.",
 }
 """What the episodes of a round show, whatever collected them."""
 

@@ -84,7 +84,7 @@ def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
     trained = load_run(run_dir, last=True)
     cells = distinct(trained, chosen.conditions())
     if chosen.suite is not None:
-        cells = reachable(trained.algorithm.task, cells)
+        cells = reachable(trained, cells)
     rows, episodes = [], []
     for row, single in evaluate_episodes(trained, cells, chosen.episodes, chosen.seed):
         rows.append(row)

@@ -298,7 +298,7 @@ def evaluate_command(options: argparse.Namespace) -> None:
     values["stage"] = _stages(runs, options.stage)
     cells = distinct(runs[0], conditions(options.suite, **values))
     if options.suite:  # of which none can be left out by hand
-        cells = reachable(runs[0].algorithm.task, cells)
+        cells = reachable(runs[0], cells)
     check_plants(runs[0].algorithm.task, cells)
     check_controllers(runs[0].recipe.l1, runs[0].algorithm.task, cells)
     # A kept checkpoint has a folder of its own: its results are not the run's.

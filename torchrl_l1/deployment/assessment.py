@@ -20,6 +20,8 @@ from torchrl_l1.control import L1Config, L1Transform, OracleTransform
 from torchrl_l1.deployment.learning import Acting, policy_transforms
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.envs import DISTURBANCES, SUITES, EnvironmentSource, suite
+from torchrl_l1.envs.factory import acting_on, episode_steps
+from torchrl_l1.envs.perturbations import active_disturbances, warn_of_late
 from torchrl_l1.experiment.l1_options import OFF, UNTUNED
 from torchrl_l1.experiment.matrix import disturbance_words, disturbed
 from torchrl_l1.report.page import markdown
@@ -308,8 +310,11 @@ def assess(
         heading: of the chart.
     """
     cells = single_disturbances(disturbances)
+    longest = min(most_steps, episode_steps(source))
     if isinstance(disturbances, str):
-        cells = [cell for cell in cells if all(source.takes(DISTURBANCES[name]) for name in cell)]
+        cells = list(filter(acting_on(source, longest), cells))
+    for cell in cells:
+        warn_of_late(active_disturbances(cell), longest)
     names = list(dict.fromkeys(name for cell in cells for name in cell))
     todo = [
         (cell, l1)

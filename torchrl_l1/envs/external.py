@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -29,6 +30,7 @@ from torchrl_l1.envs.mujoco_env import (
 )
 from torchrl_l1.envs.plant import Plant, cannot_change, disturbed_model, survives_resets
 from torchrl_l1.envs.references import code_digests, making
+from torchrl_l1.envs.simulation import LARGEST, turned_bad
 from torchrl_l1.envs.single import PAGE, SingleEnv, SingleGymnasiumEnv, SingleTorchRLEnv
 from torchrl_l1.envs.sources import EnvironmentSource, environment_source, the_same
 from torchrl_l1.envs.task import BadAction, RewardFn, Scalars, Task
@@ -186,9 +188,10 @@ class ExternalEnv(CPUEnv):
 
     Every reset of each is seeded from the seed of the whole, so that what follows depends on
     nothing that was before. Actions are clipped to the bounds, as an actuator would. Where an
-    observation or reward is not finite, that step has ``("next", "non_finite")`` and
-    ``("next", "terminated")`` set, its next observation repeats the last good one and its reward is
-    zero. Environments that a ``"_step"`` mask leaves out stay as they are.
+    observation or reward is not finite, or MuJoCo's simulation turned bad, that step has
+    ``("next", "non_finite")`` and ``("next", "terminated")`` set, its next observation repeats the
+    last good one and its reward is zero. Environments that a ``"_step"`` mask leaves out stay as
+    they are.
 
     Args:
         task: what the environments are.
@@ -280,7 +283,9 @@ class ExternalEnv(CPUEnv):
         for index in np.flatnonzero(chosen):
             stepping = self.members[index].step(actions[index])
             observation, earned, terminated[index], truncated[index] = stepping
-            bad[index] = not (np.isfinite(observation).all() and np.isfinite(earned))
+            inner = getattr(self.members[index].simulation(), "data", None)
+            broke = isinstance(inner, mujoco.MjData) and turned_bad(inner)
+            bad[index] = broke or not (np.isfinite(observation).all() and abs(earned) <= LARGEST)
             if not bad[index]:
                 self._observation[index], reward[index] = observation, earned
         self._steps += chosen

@@ -1,12 +1,14 @@
-"""One call from a name to a task, or to an environment with noise, disturbances, controllers."""
+"""From a name to a task, or to an environment with noise, disturbances that act, controllers."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import torch
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
@@ -14,11 +16,15 @@ from torchrl_l1.checks import check_optional_count
 from torchrl_l1.envs.external import external_task
 from torchrl_l1.envs.mujoco_env import BatchedMujocoEnv
 from torchrl_l1.envs.perturbations import (
+    DISTURBANCES,
     ActionNoise,
     ObservationNoise,
     active_disturbances,
     placed_transforms,
+    warn_of_late,
 )
+from torchrl_l1.envs.plant import does_nothing
+from torchrl_l1.envs.sources import EnvironmentSource, simulation_of
 from torchrl_l1.envs.task import AnyTask, Task
 from torchrl_l1.envs.tasks import TASKS, built_in_task, is_plain
 
@@ -159,6 +165,7 @@ def make_env(
         observation_keys=observation_keys,
         search_path=search_path,
     )
+    warn_of_late(active, max_steps or found.horizon)
     settings: dict[str, Any] = {
         "seed": seed,
         "max_steps": max_steps,
@@ -171,3 +178,49 @@ def make_env(
     else:
         base = found.environment(num_envs, **settings)  # type: ignore[attr-defined]
     return TransformedEnv(base, Compose(*transforms, *extra_transforms))
+
+
+def episode_steps(source: EnvironmentSource) -> float:
+    """Steps after which an episode is truncated; infinite where nobody says so."""
+    if source.task is not None:
+        return source.task.horizon
+    told = gymnasium.spec(source.gymnasium_id).max_episode_steps if source.gymnasium_id else None
+    return math.inf if told is None else told
+
+
+def acting_on(source: EnvironmentSource, horizon: float) -> Callable[[Mapping[str, float]], bool]:
+    """Tells disturbances that can act on an environment from those that cannot.
+
+    The latter are changes of a plant that cannot be reached, or that has nothing that they would
+    change (friction where nothing touches), and what begins when episodes are over.
+
+    Args:
+        source: makes the environment.
+        horizon: steps of an episode.
+
+    Returns:
+        a function of disturbances by name, whether each of them can act.
+
+    Examples:
+        >>> from torchrl_l1.envs import environment_source
+        >>> can_act = acting_on(environment_source("inverted_pendulum"), 100)
+        >>> can_act({"mass": 2.0}), can_act({"friction": 0.5})
+        (True, False)
+    """
+    if source.task is not None:
+        model = source.task.build_model()
+    else:
+        env = source.build()
+        model = getattr(simulation_of(env), "model", None)
+        env.close(raise_if_closed=False)
+
+    def can_act(disturbances: Mapping[str, float]) -> bool:
+        for name, value in disturbances.items():
+            entry = DISTURBANCES[name]
+            if not source.takes(entry) or entry.begins(value) >= horizon:
+                return False
+            if entry.acts_on == "plant" and model is not None and does_nothing(model, name, value):
+                return False
+        return True
+
+    return can_act

@@ -109,10 +109,11 @@ class BatchedMujocoEnv(CPUEnv):
     Reward and termination are evaluated in float64 on the clean state and on the action that this
     environment receives (noise and disturbances upstream included, before MuJoCo's clamping).
 
-    If the simulation of one environment turns bad (not finite, or beyond 1e10), that step has
-    ``("next", "non_finite")`` and ``("next", "terminated")`` set, its next observation repeats the
-    last good one and its reward is finite. Count these steps, and keep them out of a dynamics
-    model's data: the transition that they show did not happen.
+    If the simulation of one environment turns bad (not finite, or beyond 1e10), or the task makes
+    an observation or reward of it that is not finite, that step has ``("next", "non_finite")`` and
+    ``("next", "terminated")`` set, its next observation repeats the last good one and its reward is
+    finite. Count these steps, and keep them out of a dynamics model's data: the transition that
+    they show did not happen.
 
     Args:
         task: a key of :data:`~torchrl_l1.envs.TASKS`, or a :class:`~torchrl_l1.envs.Task`.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
@@ -166,6 +167,10 @@ class Disturbance:
     def words(self) -> str:
         """Its name in sentences and at axes, such as ``actuator bias``."""
         return self.setting.replace("_", " ")
+
+    def begins(self, value: Any) -> int:
+        """The first step of an episode that a value of it disturbs."""
+        return 0 if self.transform is None else getattr(self.transform(value), "at", 0)
 
     def check(self, value: float) -> None:
         """Refuse a value that it cannot have.
@@ -387,6 +392,17 @@ def active_disturbances(given: Mapping[str, Any]) -> list[tuple[Disturbance, Any
         for setting, entry in known.items()
         if setting in values and _differs(values[setting], entry.neutral)
     ]
+
+
+def warn_of_late(active: list[tuple[Disturbance, Any]], horizon: float) -> None:
+    """Warn of disturbances that begin when episodes of so many steps are over."""
+    for entry, value in active:
+        if (begins := entry.begins(value)) >= horizon:
+            warnings.warn(
+                f"{entry.name} does nothing here: it begins at step {begins}, and an episode has "
+                f"{horizon:g} steps",
+                stacklevel=3,
+            )
 
 
 def disturbance_transforms(**disturbances: Any) -> list[Transform]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -33,8 +34,12 @@ def _setconst(model: mujoco.MjModel) -> None:
 
 
 def _payload(model: mujoco.MjModel, fraction: float, body: int | None) -> None:
-    total = float(model.body_mass.sum())
-    model.body_mass[_first_body(model) if body is None else body] += fraction * total
+    row = _first_body(model) if body is None else body
+    before, added = float(model.body_mass[row]), fraction * float(model.body_mass.sum())
+    if before and (model.opt.density or model.opt.viscosity):
+        # MuJoCo takes the shape that a fluid flows around from the ratio of inertia and mass.
+        model.body_inertia[row] *= (before + added) / before
+    model.body_mass[row] = before + added
     _setconst(model)
 
 
@@ -46,12 +51,24 @@ def _mass(model: mujoco.MjModel, factor: float, body: int | None) -> None:
 
 
 def _friction(model: mujoco.MjModel, factor: float, body: int | None) -> None:
+    first, second = (model.geom_bodyid[geoms] for geoms in _touching(model))
+    before = _contact_friction(model)
     model.geom_friction[_geoms(model, body)] *= factor
     model.pair_friction[_pairs(model, body)] *= factor
+    if body is None:
+        return
+    own = (first == body) | (second == body)
+    if not np.allclose(_contact_friction(model)[own], factor * before[own]):
+        raise ValueError(
+            f"friction {factor:g} of {model.body(body).name!r} alone: a contact has the larger "
+            "friction of its two geoms, and what this body touches keeps its own; leave body out, "
+            "or give the geoms of the body a higher priority in the model"
+        )
 
 
 def _damping(model: mujoco.MjModel, factor: float, body: int | None) -> None:
     model.dof_damping[_joints(model, body)] *= factor
+    model.dof_dampingpoly[_joints(model, body)] *= factor
 
 
 def _armature(model: mujoco.MjModel, factor: float, body: int | None) -> None:
@@ -78,11 +95,13 @@ def _softness(model: mujoco.MjModel, factor: float, body: int | None) -> None:
 
 
 class _Change(NamedTuple):
-    """How a value changes a model, and which values there are."""
+    """How a value changes a model, which values there are, and what must be there to be changed."""
 
     apply: Callable[[mujoco.MjModel, float, int | None], None]
+    neutral: float
     sound: Callable[[float], bool]
     rule: str
+    what: str
 
 
 def _not_negative(value: float) -> bool:
@@ -94,13 +113,13 @@ def _positive(value: float) -> bool:
 
 
 _CHANGES = {
-    "payload": _Change(_payload, _not_negative, "must not be negative"),
-    "mass": _Change(_mass, _positive, "must be positive"),
-    "friction": _Change(_friction, _not_negative, "must not be negative"),
-    "damping": _Change(_damping, _not_negative, "must not be negative"),
-    "armature": _Change(_armature, _not_negative, "must not be negative"),
-    "slope": _Change(_slope, lambda value: abs(value) < 90, "must be within 90 degrees"),
-    "softness": _Change(_softness, _positive, "must be positive"),
+    "payload": _Change(_payload, 0, _not_negative, "must not be negative", "masses"),
+    "mass": _Change(_mass, 1, _positive, "must be positive", "masses"),
+    "friction": _Change(_friction, 1, _not_negative, "must not be negative", "contacts"),
+    "damping": _Change(_damping, 1, _not_negative, "must not be negative", "damped joints"),
+    "armature": _Change(_armature, 1, _not_negative, "must not be negative", "inertia of rotors"),
+    "slope": _Change(_slope, 0, lambda v: abs(v) < 90, "must be within 90 degrees", "gravity"),
+    "softness": _Change(_softness, 1, _positive, "must be positive", "contacts"),
 }
 _WIND = "wind"
 _NAMES = (*_CHANGES, _WIND)
@@ -142,7 +161,8 @@ def disturbed_model(
     name     what changes                                    value
     ======== =============================================== ==============================
     payload  a point mass in the centre of mass of a body,   fraction of the model's mass
-             the first that moves
+             the first that moves; in a fluid it is spread
+             as the mass of the body, whose drag stays
     mass     mass and inertia of all bodies                  factor
     friction friction of all contacts                        factor
     damping  damping of all joints                           factor
@@ -152,7 +172,8 @@ def disturbed_model(
     softness time constant of all contacts                   factor
     ======== =============================================== ==============================
 
-    They are made in this order. None of them is matched. Damping and armature come nearest: where
+    They are made in this order, and one that does nothing (friction where nothing can touch) gets a
+    warning. None of them is matched. Damping and armature come nearest: where
     only joints with motors have any, the change acts like an input, though one that depends on
     velocity and acceleration.
 
@@ -162,7 +183,8 @@ def disturbed_model(
         body: by name or number, to change only this body, its geoms or its joints.
 
     Raises:
-        ValueError: if there is no such change, value or body; a wind is a force and no part of a
+        ValueError: if there is no such change, value or body; if the friction of a body alone is
+            changed whose contacts have that of what it touches; a wind is a force and no part of a
             model, see :func:`wind_force`.
 
     Examples:
@@ -182,8 +204,30 @@ def disturbed_model(
     changed = copy.copy(model)
     for name, change in _CHANGES.items():
         if name in changes:
+            before = _felt(changed)
             change.apply(changed, changes[name], number)
+            if changes[name] != change.neutral and np.array_equal(_felt(changed), before):
+                warnings.warn(
+                    f"{name} {changes[name]:g} does nothing here: the model has no {change.what} "
+                    "that it could change",
+                    stacklevel=2,
+                )
     return changed
+
+
+def does_nothing(model: mujoco.MjModel, name: str, value: float) -> bool:
+    """Whether a change leaves the motion of a model as it is, as friction where nothing touches.
+
+    Args:
+        model: the model; it stays as it is.
+        name: of the change.
+        value: of the change.
+    """
+    if name == _WIND:
+        return False
+    changed = copy.copy(model)
+    _CHANGES[name].apply(changed, value, None)
+    return np.array_equal(_felt(changed), _felt(model))
 
 
 def wind_force(model: mujoco.MjModel, value: float, body: str | int | None = None) -> np.ndarray:
@@ -240,6 +284,42 @@ def _pairs(model: mujoco.MjModel, body: int | None) -> Rows:
         return _ANY
     first, second = model.geom_bodyid[model.pair_geom1], model.geom_bodyid[model.pair_geom2]
     return np.flatnonzero((first == body) | (second == body))
+
+
+def _touching(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of geoms that MuJoCo lets touch each other, whatever a model says of single pairs."""
+    first, second = np.triu_indices(model.ngeom, 1)
+    kind, with_ = model.geom_contype, model.geom_conaffinity
+    meet = (kind[first] & with_[second] | kind[second] & with_[first]) != 0
+    bodies = model.body_weldid[model.geom_bodyid]
+    parents = model.body_weldid[model.body_parentid[bodies]]
+    one, other = bodies[first], bodies[second]
+    joined = (parents[first] == other) & (other != 0) | (parents[second] == one) & (one != 0)
+    meet &= (one != other) & ~joined
+    return first[meet], second[meet]
+
+
+def _contact_friction(model: mujoco.MjModel) -> np.ndarray:
+    """Sliding friction of each of these pairs: that of the higher priority, else the larger."""
+    first, second = _touching(model)
+    one, other = model.geom_friction[first, 0], model.geom_friction[second, 0]
+    lead = model.geom_priority[first] - model.geom_priority[second]
+    return np.where(lead > 0, one, np.where(lead < 0, other, np.maximum(one, other)))
+
+
+def _felt(model: mujoco.MjModel) -> np.ndarray:
+    """What the changes reach, as far as the motion feels it."""
+    references = np.vstack([model.geom_solref[np.union1d(*_touching(model))], model.pair_solref])
+    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
+        # No contact is harder than this.
+        timed, shortest = references[:, 0] > 0, 2 * model.opt.timestep
+        references[timed, 0] = np.maximum(references[timed, 0], shortest)
+    fields = (
+        *(model.body_mass, model.body_inertia, model.opt.gravity),
+        *(model.dof_damping, model.dof_dampingpoly, model.dof_armature),
+        *(_contact_friction(model), model.pair_friction, references),
+    )
+    return np.concatenate([np.ravel(field) for field in fields])
 
 
 class Plant:

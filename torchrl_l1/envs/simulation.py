@@ -17,12 +17,27 @@ from torchrl_l1.envs.tasks import built_in_task
 
 # Beyond this magnitude MuJoCo itself calls a number bad (mjMAXVAL).
 MAX_MAGNITUDE = 1e10
+# Observations and rewards are kept in single precision, where larger ones are infinite.
+LARGEST = float(np.finfo(np.float32).max)
 _BAD_STATE = [
     int(mujoco.mjtWarning.mjWARN_BADQPOS),
     int(mujoco.mjtWarning.mjWARN_BADQVEL),
     int(mujoco.mjtWarning.mjWARN_BADQACC),
 ]
 _NO_STAGE = int(mujoco.mjtStage.mjSTAGE_NONE)
+
+
+def turned_bad(data: mujoco.MjData) -> bool:
+    """Whether a single simulation has turned bad since this was asked last.
+
+    Its warnings of bad states are cleared, since MuJoCo counts from the restart that each makes.
+    """
+    counts = data.warning.number
+    warned = counts.any() and counts[_BAD_STATE].any()
+    counts[_BAD_STATE] = 0
+    # As in :meth:`BatchedSimulator.step`, NaN included.
+    sound = np.abs(data.qpos).max() <= MAX_MAGNITUDE >= np.abs(data.qvel).max()
+    return bool(warned or not sound)
 
 
 class BatchedSimulator:
@@ -206,6 +221,9 @@ class TaskSimulation:
         simulator: the physics.
         observation: clean observations ``(N, n)``, float64. Every reset and step puts a new tensor
             here; the old one is never written to.
+
+    Raises:
+        ValueError: if a function of the task returns another shape than it should.
     """
 
     def __init__(
@@ -220,6 +238,23 @@ class TaskSimulation:
         data = mujoco.MjData(self.simulator.model)
         self._initial = (data.qpos.copy(), data.qvel.copy())
         self.observation = self._observe(self.simulator.qpos)
+        self._check_functions()
+
+    def _check_functions(self) -> None:
+        task, observation = self.task, self.observation
+        rows = (self.simulator.num_envs,)
+        action = torch.zeros(*rows, task.action_dim, dtype=torch.float64)
+        expected = {
+            "observe": (observation, (*rows, task.observation_dim)),
+            "reward": (task.reward(observation, action, observation), rows),
+            "terminated": (task.terminated(observation), rows),
+        }
+        for name, (found, shape) in expected.items():
+            if np.shape(found) != shape:
+                raise ValueError(
+                    f"Task {task.name!r}: {name} returns the shape {tuple(np.shape(found))} for "
+                    f"{rows[0]} environments, expected {shape}; correct the function or the task"
+                )
 
     def _observe(self, previous_qpos: np.ndarray) -> Tensor:
         simulator = self.simulator
@@ -251,7 +286,8 @@ class TaskSimulation:
     def step(self, action: Tensor, stepped: Tensor | None = None) -> TaskStep:
         """Advance environments by one environment step.
 
-        An environment whose simulation turns bad keeps its state and its observation.
+        An environment whose simulation turns bad keeps its state and its observation. One whose
+        task makes an observation or reward of it that is not finite keeps its observation.
 
         Args:
             action: ``(N, m)``; MuJoCo clamps it where the XML says so.
@@ -266,11 +302,17 @@ class TaskSimulation:
         indices = None if stepped is None else np.flatnonzero(stepped.numpy())
         bad = torch.from_numpy(self.simulator.step(action.numpy(), indices))
         previous, following = self.observation, self._observe(before)
+        bad |= ~(following.abs().amax(-1) <= LARGEST)  # NaN too
         kept = bad if stepped is None else bad | ~stepped
         if kept.any():
             following = torch.where(kept.unsqueeze(-1), previous, following)
-        self.observation = following
         reward = self.task.reward(previous, action, following)
+        sound = reward.abs() <= LARGEST
+        if not sound.all():
+            bad |= ~sound
+            following = torch.where(sound.unsqueeze(-1), following, previous)
+            reward = torch.where(sound, reward, 0.0)
+        self.observation = following
         return TaskStep(reward, self.task.terminated(following) | bad, bad)
 
     def _checked(self, action: Tensor, stepped: Tensor | None) -> Tensor:

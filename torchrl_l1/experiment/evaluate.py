@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,15 @@ from torchrl_l1.algorithms.policy import kinds_of
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import calibrate_filter
 from torchrl_l1.dynamics.validation import one_step_residuals
-from torchrl_l1.envs import DISTURBANCES, AnyTask, ExternalTask, Perturbation
+from torchrl_l1.envs import (
+    DISTURBANCES,
+    AnyTask,
+    ExternalTask,
+    Perturbation,
+    Task,
+    environment_source,
+)
+from torchrl_l1.envs.factory import acting_on
 from torchrl_l1.experiment.checkpoints import KEPT, kept_by, load_state, single_precision
 from torchrl_l1.experiment.errors import RunDirectoryError, fitting_into_memory, message
 from torchrl_l1.experiment.files import digest, read_text
@@ -271,14 +278,17 @@ def check_controllers(own: L1Settings, task: AnyTask, cells: Sequence[Condition]
             raise ValueError(f"L1 {cell.controller}: {error}") from error
 
 
-def reachable(task: AnyTask, cells: Sequence[Condition]) -> list[Condition]:
-    """Those conditions of a suite that can act on a task."""
-    found = []
-    for cell in cells:
-        with suppress(ValueError):
-            check_plants(task, [cell])
-            found.append(cell)
-    return found
+def reachable(trained: TrainedRun, cells: Sequence[Condition]) -> list[Condition]:
+    """Those conditions of a suite that can act on the task of a run."""
+    task = trained.algorithm.task
+    if isinstance(task, Task):
+        source = environment_source(task)
+    elif isinstance(task, ExternalTask):
+        source = task.source
+    else:
+        return list(cells)
+    can_act = acting_on(source, trained.recipe.horizon or task.horizon)
+    return [cell for cell in cells if can_act(disturbed(cell.disturbances))]
 
 
 def episodes_file(table: Path) -> Path:
