@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -99,6 +100,20 @@ def test_a_run_that_was_trained_again_takes_the_place_of_its_record(
     folder = unpack()
     assert (folder / metrics.relative_to(folder)).read_text() == again
     assert not (run / "evaluations").exists()
+
+
+def test_records_do_not_tell_where_runs_were_trained(
+    records: ModuleType, unpack: Callable[[], Path]
+) -> None:
+    run = find_runs([unpack()])[0].path
+    config = run / "config.yaml"
+    config.write_text(re.sub("run_dir: .*", f"run_dir: {run}", config.read_text()))
+    (run / "timing.csv").write_text(f"iteration\n{run},0\n")
+    records.pack(NAME, [run])
+    place = f"runs/campaigns/{NAME}/{run.relative_to(run.parents[4])}"
+    packed = [file.read_text() for file in unpack().rglob("*") if file.is_file()]
+    assert not any(str(run) in text for text in packed)
+    assert any(f"run_dir: {place}\n" in text for text in packed)
 
 
 def test_unfinished_runs_are_not_packed(records: ModuleType, unpack: Callable[[], Path]) -> None:

@@ -26,14 +26,16 @@ from contextlib import chdir
 from pathlib import Path
 
 from torchrl_l1.atomic import write_atomically
-from torchrl_l1.campaign.description import load_yaml
+from torchrl_l1.campaign.description import dump_yaml, load_yaml
 from torchrl_l1.cli import main as command
+from torchrl_l1.experiment.evaluate import table_checksums
 from torchrl_l1.experiment.run_directory import run_directories
 from torchrl_l1.report.runs import Run, find_readable_runs
 
 HERE = Path(__file__).parent
 RECORDS = "records.tar.xz"
 DESCRIPTION = "campaign.yaml"
+CAMPAIGNS = Path("runs/campaigns")
 CURVES = "l1_metrpo_curves.csv"
 TEXTS = ("config.yaml", "versions.json", "metrics.csv", "timing.csv", "diverged.txt")
 USAGE = "usage: records.py [NAME ...] | records.py pack NAME FOLDER ..."
@@ -85,15 +87,29 @@ def pack(name: str, folders: Sequence[Path]) -> int:
             for run in found.runs:
                 if not run.finished:
                     continue
-                target = campaign / behind(name, run.path, run.identity.shared["recipe"])
+                place = behind(name, run.path, run.identity.shared["recipe"])
+                target = campaign / place
                 shutil.rmtree(target, ignore_errors=True)
+                here, there = run.path.resolve(), CAMPAIGNS / name / place
                 for file in texts(run):
                     copy = target / file.relative_to(run.path)
                     copy.parent.mkdir(parents=True, exist_ok=True)
-                    shutil.copyfile(file, copy)
+                    # Where it lay on the machine that trained it is nothing to others.
+                    content = file.read_bytes().replace(bytes(here), bytes(there))
+                    copy.write_bytes(content)
+                seal(target)
         (HERE / name).mkdir(exist_ok=True)
         write_atomically(HERE / name / RECORDS, packed(campaign))
         return len(list(run_directories(campaign)))
+
+
+def seal(record: Path) -> None:
+    """Let evaluations that know the checksums of their tables know those of a record's."""
+    for file in (record / "evaluations").glob("*.yaml"):
+        settings = load_yaml(file)
+        if "checksums" in settings:
+            settings["checksums"] = table_checksums(file.with_suffix(".csv"))
+            file.write_text(dump_yaml(settings), encoding="utf-8")
 
 
 def behind(name: str, path: Path, recipe: str) -> Path:
@@ -133,7 +149,7 @@ def packed(folder: Path) -> bytes:
 def report(name: str) -> None:
     """Write the report of a campaign's records in place of the one that is there."""
     with tempfile.TemporaryDirectory() as place, chdir(place):
-        campaign = Path("runs/campaigns") / name
+        campaign = CAMPAIGNS / name
         unpack(name, campaign)
         Path(CURVES).write_bytes(lzma.decompress((HERE / f"{CURVES}.xz").read_bytes()))
         command(["report", str(campaign), "--reference-curves", CURVES])
