@@ -332,8 +332,8 @@ def test_actions_and_bounds_that_do_not_fit_are_named() -> None:
     assert found.shape == (3, 2)
     largest = torch.finfo(torch.float32).max
     for bounds, message in (
-        ((-1.0, torch.inf), "bounds must be finite"),
-        ((-largest, largest), "bounds must be finite"),
+        ((-1.0, torch.inf), "bound high must be finite"),
+        ((-largest, largest), "bound low must be finite"),
         ((1.0, -1.0), "bounds are empty"),
         ((-1.0, torch.ones(2)), "high has shape"),
     ):

@@ -173,6 +173,24 @@ def checked_bounds(
     return bounds[0], bounds[1]
 
 
+def finite_bounds(
+    low: Tensor | float | Sequence[float], high: Tensor | float | Sequence[float], like: Tensor
+) -> tuple[Tensor, Tensor]:
+    """As :func:`checked_bounds`, for what draws actions between them.
+
+    Raises:
+        ValueError: also if they are infinite, or stand for it.
+    """
+    low, high = checked_bounds(low, high, like)
+    for name, bound in (("low", low), ("high", high)):
+        if not (bound.abs() < LARGEST_BOUND).all():
+            raise ValueError(
+                f"the action bound {name} must be finite, got {bound.tolist()}: give numbers "
+                "between which to look for actions"
+            )
+    return low, high
+
+
 def one_each(function: Callable[..., Tensor], name: str, *inputs: Tensor) -> Tensor:
     """What a reward or a termination gives, which must be ``(...)`` for inputs ``(..., width)``.
 
@@ -350,12 +368,7 @@ class EnsembleModelEnv(ModelBasedEnvBase):
             observation=Unbounded((*batch_size, n), **kind), shape=batch_size, device=device
         )
         self.state_spec = self.observation_spec.clone()
-        low, high = checked_bounds(action_low, action_high, torch.empty(m, **kind))
-        if not (torch.maximum(low.abs(), high.abs()) < LARGEST_BOUND).all():
-            raise ValueError(
-                f"the action bounds must be finite, got {low.tolist()} and {high.tolist()}: give "
-                "numbers between which to act"
-            )
+        low, high = finite_bounds(action_low, action_high, torch.empty(m, **kind))
         shape = (*batch_size, m)
         self.action_spec = Bounded(low.expand(shape), high.expand(shape), shape, **kind)
         self.reward_spec = Unbounded((*batch_size, 1), **kind)

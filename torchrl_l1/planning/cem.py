@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrl_l1.checks import check_counts, check_not_negative, check_positive, check_within
+from torchrl_l1.dynamics.imagination import finite_bounds
 from torchrl_l1.planning.sequences import (
     Evaluate,
     Plan,
@@ -16,7 +17,6 @@ from torchrl_l1.planning.sequences import (
     evaluated,
     initial_variance,
     keep_best,
-    planning_bounds,
     select,
 )
 
@@ -102,7 +102,7 @@ def plan(
         >>> result.actions[0, 0].round(decimals=2)
         tensor([ 0.5000, -0.2500])
     """
-    low, high = planning_bounds(low, high, mean)
+    low, high = finite_bounds(low, high, mean)
     mean = checked_mean(mean, config.horizon, low, high)
     variance = initial_variance(config.initial_variance, low, high, mean)
     widest = variance.max().item()

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrl_l1.checks import check_counts, check_positive
+from torchrl_l1.dynamics.imagination import finite_bounds
 from torchrl_l1.planning.sequences import (
     Evaluate,
     Plan,
@@ -15,7 +16,6 @@ from torchrl_l1.planning.sequences import (
     evaluated,
     initial_variance,
     keep_best,
-    planning_bounds,
 )
 
 
@@ -74,7 +74,7 @@ def plan(
         >>> result.actions.sub(0.5).abs().max() < 0.05
         tensor(True)
     """
-    low, high = planning_bounds(low, high, mean)
+    low, high = finite_bounds(low, high, mean)
     mean = checked_mean(mean, config.horizon, low, high)
     variance = initial_variance(config.variance, low, high, mean)
     std = variance.sqrt().unsqueeze(1)

@@ -14,11 +14,12 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
 from torchrl_l1.checks import check_count
+from torchrl_l1.dynamics.imagination import finite_bounds
 from torchrl_l1.planning import cem, mppi, random_shooting
 from torchrl_l1.planning.cem import CEMConfig
 from torchrl_l1.planning.mppi import MPPIConfig
 from torchrl_l1.planning.random_shooting import ShootingConfig
-from torchrl_l1.planning.sequences import Plan, SequenceOptimizer, planning_bounds
+from torchrl_l1.planning.sequences import Plan, SequenceOptimizer
 from torchrl_l1.planning.trajectory_sampling import TrajectorySampler
 
 OptimizerConfig = CEMConfig | MPPIConfig | ShootingConfig
@@ -125,7 +126,7 @@ class ModelPredictiveController(TensorDictModuleBase):
         low, high = (
             torch.as_tensor(bound, dtype=zero.dtype) for bound in (action_low, action_high)
         )
-        self.action_low, self.action_high = planning_bounds(low, high, zero)
+        self.action_low, self.action_high = finite_bounds(low, high, zero)
         self._spec = {
             "mean": (zero.shape[1:], torch.float32),
             "step": (torch.Size([1]), torch.int64),

@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from torchrl_l1.checks import check_counts
+from torchrl_l1.dynamics.imagination import finite_bounds
 from torchrl_l1.planning.sequences import (
     Evaluate,
     Plan,
     checked_mean,
     evaluated,
     keep_best,
-    planning_bounds,
 )
 
 
@@ -67,7 +67,7 @@ def plan(
         >>> result.actions.sub(0.5).abs().max() < 0.01
         tensor(True)
     """
-    low, high = planning_bounds(low, high, mean)
+    low, high = finite_bounds(low, high, mean)
     mean = checked_mean(mean, config.horizon, low, high)
     shape = (mean.shape[0], config.candidates, *mean.shape[1:])
     uniform = torch.rand(shape, dtype=mean.dtype, device=mean.device, generator=generator)

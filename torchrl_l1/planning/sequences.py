@@ -8,8 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from torchrl_l1.checks import LARGEST_BOUND
-from torchrl_l1.dynamics.imagination import checked_bounds, untouched
+from torchrl_l1.dynamics.imagination import untouched
 
 Evaluate = Callable[[Tensor], Tensor]
 """Returns ``(N, C)`` of candidate action sequences ``(N, C, H, m)``."""
@@ -49,24 +48,6 @@ class SequenceOptimizer(Protocol):
         generator: torch.Generator | None = None,
     ) -> Plan:
         """See :func:`torchrl_l1.planning.cem.plan`."""
-
-
-def planning_bounds(
-    low: Tensor | float, high: Tensor | float, mean: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Action bounds as ``(m,)``, in type and place those of the mean.
-
-    Raises:
-        ValueError: if they are of another width, not finite, or leave no action between them.
-    """
-    low, high = checked_bounds(low, high, mean)
-    for name, bound in (("low", low), ("high", high)):
-        if not (bound.abs() < LARGEST_BOUND).all():
-            raise ValueError(
-                f"the action bound {name} must be finite, got {bound.tolist()}: give numbers "
-                "between which to look for actions"
-            )
-    return low, high
 
 
 def checked_mean(mean: Tensor, horizon: int, low: Tensor, high: Tensor) -> Tensor:
