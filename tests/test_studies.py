@@ -404,7 +404,7 @@ def test_theorem_page_quotes_the_residuals_of_the_tasks() -> None:
     ratios = [float(row["residual_largest"]) / float(row["residual_0.5"]) for row in tasks.values()]
     text = " ".join(section("docs/studies/theorem.md", "# Theorem 1, measured").split())
     assert f"is {min(ratios):.0f} to {round(max(ratios), -1):.0f} times the median one" in text
-    shares = {task: float(row["below_two_epsilon_a"]) for task, row in tasks.items()}
+    shares = {task: float(row["below_epsilon_a"]) for task, row in tasks.items()}
     walker = shares.pop("walker")
     quoted = f"({walker:.0%} of the residuals on Walker, {min(shares.values()):.0%} and more"
     assert quoted.replace("%", " %") in text

@@ -107,7 +107,7 @@ def measured(path: Path) -> tuple[Row, Tensor]:
         .mean()
         .item(),
         "epsilon_a": tolerance,
-        "below_two_epsilon_a": (size < 2 * tolerance).double().mean().item(),
+        "below_epsilon_a": (size <= tolerance).double().mean().item(),
         "change_median": change.median().item(),
         "change_0.99": torch.quantile(change, 0.99).item(),
         "change_largest": change.max().item(),
@@ -125,12 +125,12 @@ HEADINGS = {
     "beyond_reach": "beyond reach",
     "matched_share_median": "matched part",
     "epsilon_a": "epsilon_a",
-    "below_two_epsilon_a": "below 2 epsilon_a",
+    "below_epsilon_a": "below epsilon_a",
     "change_median": "change in a step, median",
     "change_largest": "its largest",
     "estimate_worse_than_none": "worse than none",
 }
-SHARES = ("beyond_reach", "matched_share_median", "below_two_epsilon_a", "estimate_worse_than_none")
+SHARES = ("beyond_reach", "matched_share_median", "below_epsilon_a", "estimate_worse_than_none")
 
 
 def shown(column: str, value: str | float) -> str:
@@ -140,14 +140,14 @@ def shown(column: str, value: str | float) -> str:
 
 
 def draw(rows: Sequence[Row], sizes: Sequence[Tensor], file: Path) -> None:
-    """How many residuals are larger than a size, beside the reach and 2 epsilon_a."""
+    """How many residuals are larger than a size, beside the reach and epsilon_a."""
     figure, axes = grid(len(rows), 3, 3.4, 2.8)
     for axis, row, size in zip(axes, rows, sizes, strict=True):
         ordered = size.sort().values
         share = 1 - torch.arange(len(size)) / len(size)
         axis.plot(ordered, share, color=color(0), label="residuals")
         axis.axvline(float(row["reach_median"]), color="black", ls="--", lw=1, label="reach")
-        axis.axvline(2 * float(row["epsilon_a"]), color="grey", ls=":", label="2 ε_a")
+        axis.axvline(float(row["epsilon_a"]), color="grey", ls=":", label="ε_a")
         axis.set(xscale="log", yscale="log", title=title(str(row["task"])))
         axis.set(xlim=(float(ordered[len(ordered) // 100]), 2 * float(ordered[-1])))
         axis.set(xlabel="norm of the residual (1/s)")

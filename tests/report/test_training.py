@@ -14,6 +14,7 @@ from scipy.stats import trim_mean
 from torchrl_l1.report import report, training
 from torchrl_l1.report.curves import Panel
 from torchrl_l1.report.identity import facts
+from torchrl_l1.report.published import ReferenceCurves
 from torchrl_l1.report.runs import find_runs
 from torchrl_l1.report.study import Study, studies
 from torchrl_l1.report.training import (
@@ -49,6 +50,26 @@ def test_training_row_against_numpy(write_run: WriteRun, tmp_path: Path) -> None
     assert (row["return_low"], row["return_high"]) == pytest.approx((expected.low, expected.high))
     assert (row["seeds"], row["real_steps"], row["unfinished"]) == (4, 7 * 2500, "")
     assert (row["paper_mean"], row["paper_std"]) == ("-105.2", "81.6")
+
+
+def test_the_authors_stand_beside_a_shorter_run_as_they_were_then(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    write_run(np.zeros(6), "l1=off", "noise=none")  # ends after 7 x 2500 real steps
+    file = tmp_path / "curves.csv"
+    columns = "arm,setting,seed,iteration,total_train_samples,average_return"
+    lines = [
+        f"L1_OFF,Inverted_Pendulum,{seed},{i},{(i + 1) * 5000 // 3},{-(i + 1) * 10**seed}"
+        for seed in range(2)
+        for i in range(20)
+    ]
+    file.write_text("\n".join([columns, *lines]) + "\n")
+    ((cell, runs),) = study(tmp_path / "runs").cells.items()
+    row = training_row(cell, runs, ReferenceCurves(file))
+    # Iterations 5 to 7 of theirs are the last that end within ours; the whole ends with 18 to 20.
+    assert (row["authors_then_mean"], row["authors_mean"]) == (-6 * 5.5, -19 * 5.5)
+    assert row["authors_then_spread"] == pytest.approx(6 * 4.5)
+    assert "| -33 ± 27 |" in training_table([row])
 
 
 def test_what_all_runs_do_unlike_their_recipe_is_told_and_bars_the_papers_numbers(

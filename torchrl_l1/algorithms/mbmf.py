@@ -3,7 +3,8 @@
 Three stages (arXiv 1708.02596): the model is fitted to real data that a random-shooting planner
 collects with it; a policy network clones the planner, by DAgger; model-free reinforcement learning
 improves the policy on real data. With L1 on, the adaptive controller augments the planner's actions
-in the first stage (arXiv 2403.14860, section "L1-MBMF"); the other two do not know of it.
+in the first stage (arXiv 2403.14860, technical remarks on MBMF in its appendix); the other two do
+not know of it.
 """
 
 from __future__ import annotations

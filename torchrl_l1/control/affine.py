@@ -90,8 +90,8 @@ def switching_law(
     r"""Whether the affine model around ``u_bar`` is too inaccurate at ``action``.
 
     arXiv 2403.14860, switching condition in section 3.2:
-    :math:`\|\hat f^a(x, u; \bar u) - \hat f(x, u)\| > \epsilon`, Euclidean norm in raw state
-    units. An error that is not a number does not switch.
+    :math:`\|\hat f^a(x, u; \bar u) - \hat f(x, u)\| > \epsilon` (printed there with
+    :math:`\ge`), Euclidean norm in raw state units. An error that is not a number does not switch.
 
     The affine model is compared at one input only, which takes one directional derivative; the
     Jacobian is evaluated once per step, at the operating point that this law selects.

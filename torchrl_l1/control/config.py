@@ -41,7 +41,7 @@ _CHOICES = {
 
 @dataclass(frozen=True)
 class L1Config:
-    r"""Settings of the L1 adaptive controller (arXiv 2403.14860, sections 3.1 and 3.2).
+    r"""Settings of the L1 adaptive controller (arXiv 2403.14860, sections 2.2 and 3.2).
 
     The defaults are those of the paper's Algorithms 1 and 2; :meth:`reference` gives the
     settings of the authors' released controller, and :meth:`robust` those of the controller

@@ -75,10 +75,12 @@ def step(
         \hat\sigma &= -\Phi^{-1} \exp(A_s T)\, \tilde x,
             \qquad \Phi = A_s^{-1} (\exp(A_s T) - I) \\
         J \sigma_m &\approx T \hat\sigma \quad\text{(least squares)} \\
-        q &\leftarrow q + \alpha (\sigma_m - q) \\
+        q &\leftarrow q + \alpha (\sigma_{m, t-1} - q) \\
         u &= \mathrm{clip}(u_{RL} - q) \\
         \hat x &\leftarrow \hat x + d_t + J u + T (\hat\sigma + A_s \tilde x)
 
+    An episode begins with :math:`\hat x = x` and :math:`q = \sigma_m = 0`. The filter takes the
+    matched part of the step before, with ``filter_input="current"`` that of this one.
     The estimate :math:`\hat\sigma` is in state units per second and the matched part
     :math:`\sigma_m` in action units. What the least squares leaves over is unmatched: it enters
     the prediction and no action cancels it. The predictor sees the saturated input. Before the

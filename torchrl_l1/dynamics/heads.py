@@ -70,7 +70,7 @@ class DeterministicHead(Head):
         return dim
 
     def loss(self, raw: Tensor, target: Tensor) -> Tensor:
-        """Squared error averaged over the target's columns (arXiv 2403.14860, section 3.1)."""
+        """Squared error, averaged over the columns (arXiv 2403.14860, section 3.1, sums it)."""
         return (raw - target).square().mean(-1)
 
     def standard_deviation(self, raw: Tensor) -> Tensor:

@@ -124,6 +124,25 @@ class Curves:
     real_steps: np.ndarray
     returns: np.ndarray
 
+    def until(self, real_steps: float) -> Curves | None:
+        """The iterations that end within so many real steps, give or take half a one of them.
+
+        Args:
+            real_steps: where to cut.
+
+        Returns:
+            the curves up to there, all of them if they end before; ``None`` if none begins before.
+
+        Example:
+            >>> curves = Curves(np.array([[5.0, 10.0, 15.0]]), np.array([[-3.0, -2.0, -1.0]]))
+            >>> curves.until(11.0).returns.tolist(), curves.until(2.0)
+            ([[-3.0, -2.0]], None)
+        """
+        steps = self.real_steps.mean(0)
+        half = (steps[-1] - steps[0]) / max(2 * (len(steps) - 1), 1)
+        kept = int((steps <= real_steps + half).sum())
+        return Curves(self.real_steps[:, :kept], self.returns[:, :kept]) if kept else None
+
 
 class ReferenceCurves:
     """The authors' curves, in the layout of their parsed logs.

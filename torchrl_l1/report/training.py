@@ -180,6 +180,10 @@ def training_row(
             "authors_spread": published_spread(curves.returns),
             "authors_seeds": len(curves.returns),
         }
+        reached = curves.until(row["real_steps"]) if done else None
+        if reached is not None:
+            row["authors_then_mean"] = float(final_return(reached.returns).mean())
+            row["authors_then_spread"] = published_spread(reached.returns)
     return row
 
 
@@ -241,6 +245,9 @@ def training_table(rows: Sequence[Row]) -> str:
             "saturation": number(row.get("saturation")),
             "paper": paper_text(row, notes),
             "authors' logs": spread_text(row.get("authors_mean"), row.get("authors_spread")),
+            "after as many steps": spread_text(
+                row.get("authors_then_mean"), row.get("authors_then_spread")
+            ),
             "unfinished": row["unfinished"],
         }
         for row in rows
