@@ -27,6 +27,8 @@ from torchrl_l1.campaign.jobs import LAUNCHERS
 from torchrl_l1.campaign.plan import plan
 from torchrl_l1.cli import main
 from torchrl_l1.control import L1Config
+from torchrl_l1.deployment import load_policy
+from torchrl_l1.deployment.policy_files import FILE_KINDS
 from torchrl_l1.envs import DISTURBANCES, TASKS, gymnasium_id
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.recipes import available_campaigns, available_recipes, recipes_dir
@@ -185,6 +187,15 @@ def test_commands_of_the_pages_exist_with_their_options(help_texts: dict[str, st
         for option in (text for text in arguments if text.startswith("--")):
             of_hydra = command == "run" and option in ("--cfg", "--info")
             assert of_hydra or option in help_texts[command], f"{command} {option}"
+
+
+def test_policies_that_are_files_are_told_by_the_kinds_that_there_are(
+    help_texts: dict[str, str],
+) -> None:
+    page = (ROOT / "docs/robustify.md").read_text()
+    kinds = {f"{name}:{kind.form}" for name, kind in FILE_KINDS.items()}
+    for text in (page, load_policy.__doc__, help_texts["robustify"]):
+        assert set(re.findall(r"\w+:FILE(?:\.\w+)?", text)) == kinds
 
 
 @pytest.mark.parametrize("arguments", [text for text in COMMANDS if text[0] == "run"], ids=" ".join)

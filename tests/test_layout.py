@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "torchrl_l1"
 FILES = sorted(PACKAGE.rglob("*.py"))
-MOST_FILES, MOST_LINES = 167, 500
+MOST_FILES, MOST_LINES = 175, 500
 PLACES = ("torchrl_l1", "tests", "docs", "benchmarks")
 
 # Each may import from those before it.

@@ -9,13 +9,20 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
+import torch
 from matplotlib.figure import Figure
 from scipy.stats import ttest_1samp
 
 from tests.test_studies import RESULTS, script
+from torchrl_l1.algorithms.collection import ORACLE, make_pipeline
+from torchrl_l1.control import L1Config, kalman_law
+from torchrl_l1.control.kalman import Posterior
+from torchrl_l1.control.state import init
+from torchrl_l1.envs import TASKS, Perturbation
 
 
 @pytest.fixture
@@ -148,3 +155,45 @@ def test_qualities_that_a_campaign_lacks_are_kept(
     assert [row["return"] for row in offline.select(after, **of_run)] == [7.0]
     others = [row for row in before if not offline.select([row], **of_run)]
     assert [row for row in after if not offline.select([row], **of_run)] == others
+
+
+CONFIG = L1Config.robust(0.02, action_low=-1.0, action_high=1.0)
+
+
+def test_robust_controllers_act_by_the_rule_of_a_study(monkeypatch: pytest.MonkeyPatch) -> None:
+    acting = script("acting", monkeypatch)
+    known = Posterior(torch.full((1, 1), 0.1), torch.ones(1, 1, 1))  # within the dead zone
+    estimated = kalman_law.Estimate(known, *[torch.zeros(1, 1)] * 5)
+
+    def correction() -> float:
+        return float(kalman_law.adapted(CONFIG, estimated, torch.zeros(1, 1)).q)
+
+    assert correction() == 0
+    with acting.acting_by(lambda posterior: 3 * posterior.mean):
+        assert correction() == pytest.approx(0.3)
+    assert correction() == 0
+
+
+def test_what_a_study_puts_in_place_of_the_shipped_controller_acts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bounds = script("at_the_bounds", monkeypatch)
+    one = torch.ones(2, 1)
+    # At the upper bound, where a disturbance outwards is expected to end.
+    state = init([2], 1, 1, CONFIG)._replace(
+        u_bar=one, sigma_m=0.5 * one, started=one.bool(), covariance=0.1 * one, jacobian=one
+    )
+
+    def believes() -> list[bool]:
+        """Whether pushes of the plant inwards and outwards change the estimate."""
+        estimated = kalman_law.estimate(CONFIG, state, torch.tensor([[-4.0], [4.0]]))
+        return (estimated.posterior.mean != 0.5).flatten().tolist()
+
+    assert believes() == [True, False]
+    with mock.patch.object(*bounds.NOTHING_CONTRADICTS):
+        assert believes() == [False, False]
+    with mock.patch.object(*bounds.NOTHING_ENDS):
+        assert believes() == [True, True]
+    with mock.patch.object(*bounds.LATE):
+        env = make_pipeline(TASKS["inverted_pendulum"], 1, Perturbation(), None, ORACLE)
+    assert sum(isinstance(one, bounds.LateOracle) for one in env.transform) == 1

@@ -14,8 +14,10 @@ from __future__ import annotations
 import csv
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
@@ -66,10 +68,15 @@ def less_expected(expected: Tensor) -> Rule:
     return lambda posterior: posterior.mean - expected
 
 
+def acting_by(rule: Rule) -> AbstractContextManager[object]:
+    """Meanwhile robust controllers act on their estimates by a rule."""
+    return mock.patch.object(kalman, "significant", lambda posterior, dead_zone: rule(posterior))
+
+
 def rules(trained: TrainedRun) -> dict[str, Rule]:
     """By name; the one that needs undisturbed episodes takes them from the policy itself."""
-    kalman.significant = lambda posterior, dead_zone: torch.zeros_like(posterior.mean)
-    idle = make_collection(trained, Condition("robust"), EPISODES).evaluate(SEED + 1)
+    with acting_by(lambda posterior: torch.zeros_like(posterior.mean)):
+        idle = make_collection(trained, Condition("robust"), EPISODES).evaluate(SEED + 1)
     expected = idle["next", "l1", "sigma_m"].flatten(0, -2).mean(0)
     return {
         "everything (z = 0)": lambda posterior: posterior.mean,
@@ -93,8 +100,8 @@ def compare(trained: TrainedRun) -> list[Row]:
             oracle = _returns(trained, Condition("oracle", **cell))
             rows.append(_row(trained, name, "oracle", oracle, off))
         for rule, function in rules(trained).items():
-            kalman.significant = lambda posterior, dead_zone, f=function: f(posterior)
-            robust = _returns(trained, Condition("robust", **cell))
+            with acting_by(function):
+                robust = _returns(trained, Condition("robust", **cell))
             rows.append(_row(trained, name, rule, robust, off))
         returns = [round(row["return"]) for row in rows if row["condition"] == name]
         print(trained.path, name, returns, flush=True)

@@ -2,12 +2,15 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.envs import GymEnv
 
-from torchrl_l1.deployment import RobustController, robustify
+from torchrl_l1.deployment import RobustController, robustify, vector_environment
 from torchrl_l1.dynamics import FitConfig
 
 # A state feedback that balances the pendulum of the tasks.
 GAIN = (1.0, 10.0, 1.0, 2.0)
+OBSERVATION = torch.linspace(-0.1, 0.1, 12).reshape(3, 4)
 
 POLICY_FILE = """
 import torch
@@ -35,6 +38,16 @@ def make_env():
 
 def balance(observation: torch.Tensor) -> torch.Tensor:
     return (observation @ torch.tensor(GAIN)).unsqueeze(-1)
+
+
+def actions(policy, observation):
+    data = TensorDict(observation=observation, batch_size=observation.shape[:-1])
+    return policy(data)["action"]
+
+
+@pytest.fixture(scope="module")
+def env():
+    return vector_environment(GymEnv("InvertedPendulum-v5"))
 
 
 @pytest.fixture(scope="session")

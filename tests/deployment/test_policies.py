@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import sys
 import warnings
 from types import SimpleNamespace
 
@@ -11,35 +10,15 @@ from gymnasium import spaces
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.data import Bounded, Unbounded
-from torchrl.envs import GymEnv
 from torchrl.modules import LSTMModule
 
 from torchrl_l1.control import L1Controller
-from torchrl_l1.deployment import (
-    FunctionPolicy,
-    environment_source,
-    load_policy,
-    vector_environment,
-)
+from torchrl_l1.deployment import FunctionPolicy, environment_source, load_policy
 from torchrl_l1.deployment.learning import policy_transforms
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.run import run
 
-from .conftest import balance
-
-
-@pytest.fixture(scope="module")
-def env():
-    return vector_environment(GymEnv("InvertedPendulum-v5"))
-
-
-def actions(policy, observation):
-    data = TensorDict(observation=observation, batch_size=observation.shape[:-1])
-    return policy(data)["action"]
-
-
-BOX = spaces.Box(-1.0, 1.0, (2,))
-OBSERVATION = torch.linspace(-0.1, 0.1, 12).reshape(3, 4)
+from .conftest import OBSERVATION, actions, balance
 
 
 @pytest.mark.parametrize(
@@ -81,12 +60,6 @@ def test_what_is_no_policy(env, policy, message):
         load_policy(policy, env)
 
 
-def test_files_that_are_not_there(env):
-    for kind in ("sb3", "torchscript", "onnx"):
-        with pytest.raises(FileNotFoundError, match="no file missing"):
-            load_policy(f"{kind}:missing", env)
-
-
 @pytest.mark.parametrize("name", ["balance", "make"])
 def test_functions_of_files_and_functions_that_return_them(env, policy_file, name):
     policy = load_policy(f"{policy_file}:{name}", env)
@@ -121,16 +94,6 @@ def test_torchrl_modules_are_taken_as_they_are(env):
     assert load_policy(module, env) is module
 
 
-def test_torchscript(env, tmp_path):
-    module = torch.nn.Sequential(torch.nn.Linear(4, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        torch.jit.script(module).save(str(tmp_path / "policy.pt"))
-    policy = load_policy(f"torchscript:{tmp_path / 'policy.pt'}", env)
-    assert isinstance(policy, FunctionPolicy)
-    torch.testing.assert_close(actions(policy, OBSERVATION), module(OBSERVATION))
-
-
 def test_run_directories(env, tiny_recipe, tmp_path):
     run(tiny_recipe("outer_iterations=1"))
     policy = load_policy(str(tmp_path / "run"), env)
@@ -141,111 +104,6 @@ def test_run_directories(env, tiny_recipe, tmp_path):
 
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         torch.testing.assert_close(actions(policy, OBSERVATION), mean.clamp(-3, 3))
-
-
-def test_onnx(env, tmp_path):
-    onnx = pytest.importorskip("onnx")
-    pytest.importorskip("onnxruntime")
-    weights = np.array([[1.0], [10.0], [1.0], [2.0]], np.float32)
-    kind = onnx.TensorProto.FLOAT
-    graph = onnx.helper.make_graph(
-        [onnx.helper.make_node("MatMul", ["x", "w"], ["u"])],
-        "policy",
-        [onnx.helper.make_tensor_value_info("x", kind, ["N", 4])],
-        [onnx.helper.make_tensor_value_info("u", kind, ["N", 1])],
-        [onnx.numpy_helper.from_array(weights, "w")],
-    )
-    opset = [onnx.helper.make_opsetid("", 17)]
-    onnx.save(onnx.helper.make_model(graph, opset_imports=opset, ir_version=9), tmp_path / "p.onnx")
-    policy = load_policy(f"onnx:{tmp_path / 'p.onnx'}", env)
-    torch.testing.assert_close(actions(policy, OBSERVATION), balance(OBSERVATION))
-
-
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", ["PPO", "SAC"])
-def test_stable_baselines_acts_as_its_predict(env, tmp_path, name):
-    sb3 = pytest.importorskip("stable_baselines3")
-    model = getattr(sb3, name)("MlpPolicy", "InvertedPendulum-v5", seed=0, device="cpu")
-    model.save(tmp_path / "model.zip")
-    expected, _ = model.predict(OBSERVATION.numpy(), deterministic=True)
-    for source in (f"sb3:{tmp_path / 'model.zip'}", model):
-        found = actions(load_policy(source, env), OBSERVATION)
-        torch.testing.assert_close(found, torch.as_tensor(expected))
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_statistics_of_vecnormalize_need_a_word(env, tmp_path):
-    sb3 = pytest.importorskip("stable_baselines3")
-    from stable_baselines3.common.env_util import make_vec_env
-    from stable_baselines3.common.vec_env import VecNormalize
-
-    normalized = VecNormalize(make_vec_env("InvertedPendulum-v5", 1), clip_obs=2.0)
-    normalized.obs_rms.mean, normalized.obs_rms.var = np.full(4, 0.02), np.full(4, 0.003)
-    model = sb3.PPO("MlpPolicy", normalized, seed=0, device="cpu")
-    model.save(tmp_path / "model.zip")
-    normalized.save(tmp_path / "vecnormalize.pkl")
-    source = f"sb3:{tmp_path / 'model.zip'}"
-    with pytest.raises(ValueError, match="executes what is in it"):
-        load_policy(source, env)
-    raw = actions(load_policy(source, env, normalization="none"), OBSERVATION)
-    torch.testing.assert_close(
-        raw, torch.as_tensor(model.predict(OBSERVATION.numpy(), deterministic=True)[0])
-    )
-    statistics = str(tmp_path / "vecnormalize.pkl")
-    found = actions(load_policy(source, env, normalization=statistics), OBSERVATION)
-    scaled = normalized.normalize_obs(OBSERVATION.numpy())
-    expected = torch.as_tensor(model.predict(scaled, deterministic=True)[0])
-    torch.testing.assert_close(found, expected)
-    assert not torch.allclose(found, raw)
-
-
-@pytest.mark.parametrize(
-    "statistics",
-    [
-        "vecnormalize.pkl",
-        "vec_normalize.pkl",
-        "VecNormalize-best.pkl",
-        "rl_model_vecnormalize_64_steps.pkl",
-        "rl_model_64_steps/vecnormalize.pkl",
-    ],
-)
-def test_statistics_are_found_by_all_their_usual_names(env, tmp_path, monkeypatch, statistics):
-    """Of Stable-Baselines3's callback, its Zoo and the hub; nothing is read before."""
-    monkeypatch.setitem(sys.modules, "stable_baselines3", SimpleNamespace())
-    model = tmp_path / "rl_model_64_steps.zip"
-    model.touch()
-    (tmp_path / "replay_buffer.pkl").touch()
-    with pytest.raises(ValueError, match="cannot be read as sb3"):
-        load_policy(f"sb3:{model}", env)
-    (tmp_path / statistics).parent.mkdir(exist_ok=True)
-    (tmp_path / statistics).touch()
-    with pytest.raises(ValueError, match=rf"{statistics} stands beside .*, or say 'none'"):
-        load_policy(f"sb3:{model}", env)
-
-
-def test_of_several_statistics_those_of_the_model_s_steps_are_named(env, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "stable_baselines3", SimpleNamespace())
-    for steps in (8, 64, 128):
-        (tmp_path / f"rl_model_{steps}_steps.zip").touch()
-        (tmp_path / f"rl_model_vecnormalize_{steps}_steps.pkl").touch()
-    with pytest.raises(ValueError, match=r"vecnormalize_64_steps\.pkl stands beside"):
-        load_policy(f"sb3:{tmp_path / 'rl_model_64_steps.zip'}", env)
-
-
-@pytest.mark.parametrize(
-    ("observation", "action", "message"),
-    [
-        (spaces.Dict({"goal": BOX}), BOX, r"the policy reads Dict\('goal': Box"),
-        (BOX, spaces.Discrete(2), r"the policy acts in Discrete\(2\): it must"),
-        (spaces.Box(0, 255, (8, 8, 3)), BOX, "Box of one dimension"),
-    ],
-)
-def test_models_of_other_spaces_are_refused(env, observation, action, message):
-    policy = SimpleNamespace(
-        squash_output=False, observation_space=observation, action_space=action
-    )
-    with pytest.raises(ValueError, match=message):
-        load_policy(SimpleNamespace(policy=policy, predict=len), env)
 
 
 @pytest.mark.parametrize(("bound", "warned"), [(3.0, False), (1.0, True)])
@@ -393,20 +251,6 @@ def test_the_memory_of_a_recurrent_policy_is_carried(env):
     # An environment that has all this already gets none of it again.
     own = source.single(control=policy_transforms(policy, source.one))
     assert policy_transforms(policy, lambda: own) == []
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_a_model_of_stable_baselines_brings_its_normaliser(env):
-    sb3 = pytest.importorskip("stable_baselines3")
-    from stable_baselines3.common.env_util import make_vec_env
-    from stable_baselines3.common.vec_env import VecNormalize
-
-    normalized = VecNormalize(make_vec_env("InvertedPendulum-v5", 1), clip_obs=2.0)
-    normalized.obs_rms.mean, normalized.obs_rms.var = np.full(4, 0.02), np.full(4, 0.003)
-    model = sb3.PPO("MlpPolicy", normalized, seed=0, device="cpu")
-    scaled = normalized.normalize_obs(OBSERVATION.numpy())
-    expected = torch.as_tensor(model.predict(scaled, deterministic=True)[0])
-    torch.testing.assert_close(actions(load_policy(model, env), OBSERVATION), expected)
 
 
 def test_modules_in_train_mode(env):

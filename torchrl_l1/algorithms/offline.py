@@ -45,7 +45,7 @@ from torchrl_l1.algorithms.policy_improvement import (
 )
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import read_transitions
-from torchrl_l1.dynamics.imagination import one_each
+from torchrl_l1.dynamics.functions import one_each
 from torchrl_l1.dynamics.network import model_precision
 from torchrl_l1.dynamics.transitions import Data, check_time_step
 from torchrl_l1.envs import AnyTask, Perturbation, action_bounds

@@ -23,7 +23,7 @@ from torchrl_l1.dynamics import (
     fit_termination,
 )
 from torchrl_l1.dynamics.ensemble import ACTIVATIONS
-from torchrl_l1.dynamics.imagination import RewardFunction, Termination
+from torchrl_l1.dynamics.functions import RewardFunction, Termination
 from torchrl_l1.dynamics.transitions import split_validation
 from torchrl_l1.envs import AnyTask, ExternalTask, StartStates, Task, action_bounds, load_attribute
 

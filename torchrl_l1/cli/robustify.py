@@ -15,6 +15,7 @@ from torchrl_l1.checks import check_count
 from torchrl_l1.cli.evaluate import Gathered
 from torchrl_l1.deployment import Assessment, RobustController, robustify
 from torchrl_l1.deployment.controller_folder import FILE, check_replaces
+from torchrl_l1.deployment.policies import FORMS
 from torchrl_l1.deployment.robust_controller import PRESETS
 from torchrl_l1.envs import DISTURBANCES, SUITES, environment_source
 from torchrl_l1.experiment.checkpoints import kept_by
@@ -47,8 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--policy",
         required=True,
-        help="sb3:FILE.zip, torchscript:FILE, onnx:FILE, MODULE:NAME, FILE.py:NAME, or a run "
-        "directory",
+        help=FORMS,
     )
     add(
         "--normalization",

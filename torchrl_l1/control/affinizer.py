@@ -11,13 +11,13 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
 from torchrl_l1.control.affine import affinize, operating_point
-from torchrl_l1.control.jacobian import Predicts
 from torchrl_l1.control.layout import (
     Dynamics,
     as_action_jacobian,
     declared_dimension,
     required_entry,
 )
+from torchrl_l1.control.module_model import Predicts
 
 _STATE = ("u_bar", "started")
 

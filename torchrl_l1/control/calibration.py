@@ -94,36 +94,10 @@ def calibrate(
     """
     if config.filter != "kalman":
         raise ValueError("there is nothing to calibrate without filter='kalman'")
-    sequences, steps, n, m = jacobian.shape
-    if residual.shape != (sequences, steps, n):
-        raise ValueError(
-            f"residual has shape {tuple(residual.shape)}, expected {(sequences, steps, n)} as the "
-            "Jacobian"
-        )
-    if steps < 2 * _SETTLED or sequences < 1:
-        raise ValueError(
-            f"calibration needs episodes of at least {2 * _SETTLED} steps, got {sequences} of "
-            f"{steps}"
-        )
+    sequences, steps, _, m = jacobian.shape
     action = jacobian.new_zeros(sequences, steps, m) if action is None else action
-    if action.shape != (sequences, steps, m):
-        raise ValueError(
-            f"action has shape {tuple(action.shape)}, expected {(sequences, steps, m)} as the "
-            "Jacobian"
-        )
-    if not all(values.isfinite().all() for values in (residual, jacobian, action)):
-        raise ValueError(
-            "calibration needs finite residuals, Jacobians and actions: leave the others out"
-        )
     covariance = covariance.to(residual)
-    is_whole = config.estimator == "weighted"
-    shapes = (n, n), (sequences, steps, n, n)
-    if covariance.shape not in shapes or not is_positive(covariance, is_whole):
-        raise ValueError(
-            f"calibration needs a positive definite covariance of the shape {shapes[0]} or "
-            f"{shapes[1]}, got {tuple(covariance.shape)}: give states without residuals a small "
-            "variance"
-        )
+    _check_recorded(config, residual, jacobian, action, covariance)
     if generator is None:
         generator = torch.Generator().manual_seed(0)
     half_range = torch.as_tensor(config.half_range).to(residual).expand(m)
@@ -164,6 +138,40 @@ def calibrate(
         key=lambda row: row["process_noise"],
     )
     return Calibration(best["inflation"], best["process_noise"], table)
+
+
+def _check_recorded(
+    config: L1Config, residual: Tensor, jacobian: Tensor, action: Tensor, covariance: Tensor
+) -> None:
+    """Refuse episodes that the filter cannot be calibrated with; shapes are the Jacobian's."""
+    sequences, steps, n, m = jacobian.shape
+    if residual.shape != (sequences, steps, n):
+        raise ValueError(
+            f"residual has shape {tuple(residual.shape)}, expected {(sequences, steps, n)} as the "
+            "Jacobian"
+        )
+    if steps < 2 * _SETTLED or sequences < 1:
+        raise ValueError(
+            f"calibration needs episodes of at least {2 * _SETTLED} steps, got {sequences} of "
+            f"{steps}"
+        )
+    if action.shape != (sequences, steps, m):
+        raise ValueError(
+            f"action has shape {tuple(action.shape)}, expected {(sequences, steps, m)} as the "
+            "Jacobian"
+        )
+    if not all(values.isfinite().all() for values in (residual, jacobian, action)):
+        raise ValueError(
+            "calibration needs finite residuals, Jacobians and actions: leave the others out"
+        )
+    is_whole = config.estimator == "weighted"
+    shapes = (n, n), (sequences, steps, n, n)
+    if covariance.shape not in shapes or not is_positive(covariance, is_whole):
+        raise ValueError(
+            f"calibration needs a positive definite covariance of the shape {shapes[0]} or "
+            f"{shapes[1]}, got {tuple(covariance.shape)}: give states without residuals a small "
+            "variance"
+        )
 
 
 def _honest(table: list[dict[str, float]], process_noise: float) -> dict[str, float]:

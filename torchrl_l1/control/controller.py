@@ -18,7 +18,6 @@ from torchrl.envs.transforms import TensorDictPrimer, Transform
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control.affine import StepFunction, make_step
 from torchrl_l1.control.config import L1Config, Scalars, with_open_bounds
-from torchrl_l1.control.jacobian import Predicts
 from torchrl_l1.control.layout import (
     L1_KEY,
     Dynamics,
@@ -30,6 +29,7 @@ from torchrl_l1.control.layout import (
     entry_name,
     required_entry,
 )
+from torchrl_l1.control.module_model import Predicts
 from torchrl_l1.control.pipeline import (
     Settings,
     carry,

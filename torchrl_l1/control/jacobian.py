@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+from torchrl_l1.control.module_model import Predicts, read_module
 from torchrl_l1.control.probe import (
     FORWARD_MODE,
     ChangeFunction,
@@ -23,7 +23,6 @@ from torchrl_l1.control.probe import (
 )
 from torchrl_l1.control.state import ResidualStatistics
 
-Predicts = Literal["change", "next_observation"]
 Expansion = tuple[Tensor, Callable[[Tensor], tuple[Tensor, Tensor]]]
 
 
@@ -118,10 +117,9 @@ class ActionJacobian:
                 "action)"
             )
         elif isinstance(dynamics, TensorDictModuleBase):
-            out_key = _prediction_key(dynamics, observation_key, action_key, out_key)
-            self._predict = _on_tensors(dynamics, observation_key, action_key, out_key)
-            if predicts is None:
-                predicts = _told_by(out_key, observation_key)
+            self._predict, predicts = read_module(
+                dynamics, observation_key, action_key, out_key, predicts
+            )
         elif callable(dynamics):
             if out_key is not None:
                 raise ValueError("out_key applies to TensorDictModules only")
@@ -432,66 +430,3 @@ def _load_forward_mode() -> None:
     with FORWARD_MODE, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.func.jvp(torch.sin, (torch.zeros(()),), (torch.ones(()),))
-
-
-def _prediction_key(
-    module: TensorDictModuleBase,
-    observation_key: NestedKey,
-    action_key: NestedKey,
-    out_key: NestedKey | None,
-) -> NestedKey:
-    unknown = [key for key in module.in_keys if key not in (observation_key, action_key)]
-    if unknown or len(module.in_keys) != 2:
-        raise ValueError(
-            f"the dynamics module reads {module.in_keys}; it must read exactly "
-            f"{observation_key!r} and {action_key!r} (see observation_key and action_key)"
-        )
-    if out_key is None:
-        if len(module.out_keys) != 1:
-            raise ValueError(
-                f"the dynamics module writes {module.out_keys}: name its prediction with out_key"
-            )
-        return module.out_keys[0]
-    if out_key not in module.out_keys:
-        raise ValueError(f"the dynamics module writes {module.out_keys}, not out_key={out_key!r}")
-    return out_key
-
-
-_CHANGE = {"change", "changes", "delta", "deltas", "diff", "difference", "increment", "dx", "dobs"}
-_NEXT = {"next", "following", "successor"}
-
-
-def _told_by(out_key: NestedKey, observation_key: NestedKey) -> Predicts:
-    """What a module predicts, by the key that it writes."""
-    path, observed = _path(out_key), _path(observation_key)
-    if path in (observed, ("next", *observed)):
-        return "next_observation"
-    words = set(path[-1].lower().replace("-", "_").split("_"))
-    if words & _CHANGE or path[-1].startswith("d_"):
-        return "change"
-    if path[0] == "next" or words & _NEXT:
-        return "next_observation"
-    raise ValueError(
-        f"the dynamics module writes {out_key!r}, which does not tell what it predicts: give "
-        "predicts='change' or predicts='next_observation'"
-    )
-
-
-def _path(key: NestedKey) -> tuple[str, ...]:
-    key = unravel_key(key)
-    return (key,) if isinstance(key, str) else key
-
-
-def _on_tensors(
-    module: TensorDictModuleBase,
-    observation_key: NestedKey,
-    action_key: NestedKey,
-    out_key: NestedKey,
-) -> ChangeFunction:
-    def predict(observation: Tensor, action: Tensor) -> Tensor:
-        data = TensorDict({}, batch_size=observation.shape[:-1])
-        data.set(observation_key, observation)
-        data.set(action_key, action)
-        return module(data).get(out_key)
-
-    return predict

@@ -16,7 +16,8 @@ from torchrl.envs import EnvBase
 
 from torchrl_l1.control.affine import StepFunction
 from torchrl_l1.control.config import L1Config, Scalars, with_open_bounds
-from torchrl_l1.control.jacobian import ActionJacobian, ChangeFunction, DynamicsModel, Predicts
+from torchrl_l1.control.jacobian import ActionJacobian, ChangeFunction, DynamicsModel
+from torchrl_l1.control.module_model import Predicts
 from torchrl_l1.control.seal import SEAL, Emitted, seal_width, verify
 from torchrl_l1.control.state import L1Diagnostics, L1State, init
 

@@ -16,7 +16,6 @@ from torchrl.envs.transforms import Transform
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.control.affine import StepFunction, make_step
 from torchrl_l1.control.config import L1Config
-from torchrl_l1.control.jacobian import Predicts
 from torchrl_l1.control.layout import (
     L1_KEY,
     Advanced,
@@ -26,6 +25,7 @@ from torchrl_l1.control.layout import (
     as_action_jacobian,
     entry_name,
 )
+from torchrl_l1.control.module_model import Predicts
 from torchrl_l1.control.pipeline import (
     Settings,
     carry,

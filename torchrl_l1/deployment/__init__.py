@@ -4,7 +4,8 @@ from torchrl_l1.control import time_step
 from torchrl_l1.deployment.assessment import Assessment
 from torchrl_l1.deployment.export import ControlledStep, Exported, export
 from torchrl_l1.deployment.learning import Exploration, target_switch_rate
-from torchrl_l1.deployment.policies import FunctionPolicy, StableBaselinesPolicy, load_policy
+from torchrl_l1.deployment.policies import FunctionPolicy, load_policy
+from torchrl_l1.deployment.policy_files import StableBaselinesPolicy
 from torchrl_l1.deployment.robust_controller import RobustController, load_target
 from torchrl_l1.deployment.robustification import robustify
 from torchrl_l1.envs import EnvironmentSource, environment_source, vector_environment

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from torchrl_l1.atomic import write_atomically
 from torchrl_l1.control import L1Config
 from torchrl_l1.deployment.policies import Policy
+from torchrl_l1.deployment.policy_files import FILE_KINDS
 from torchrl_l1.envs import code_digests, file_digest
-from torchrl_l1.envs.references import require
 from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.files import read_text
 from torchrl_l1.experiment.run_directory import RunDirectory, read_config
@@ -23,25 +23,18 @@ FILE, MODEL = "controller.json", "model.safetensors"
 FORMAT = 1
 """Of the settings."""
 
-FILE_KINDS = ("sb3", "torchscript", "onnx")
-"""Kinds of policies that are files."""
-
 _MOST_BYTES = 1_000_000
 _WITH = " with "
 
 
-def copied(file: Path, folder: Path, role: str, kind: str = "") -> str:
-    """Put a copy of a file into a folder, unless it is that of the folder; its name there.
-
-    A model of the kind ``onnx`` has in it what it kept in other files.
-    """
+def copied(
+    file: Path, folder: Path, role: str, content: Callable[[Path], bytes] = Path.read_bytes
+) -> str:
+    """Put a copy of a file into a folder, unless it is that of the folder; its name there."""
     # With its role, since files of different folders may have one name.
     target = folder / (file.name if file.name.startswith(role) else f"{role}_{file.name}")
     if file.resolve() != target.resolve():
-        content = file.read_bytes()
-        if kind == "onnx" and b"location" in content:  # by which it names other files
-            content = require("onnx", "onnx").load(str(file)).SerializeToString()
-        write_atomically(target, content)
+        write_atomically(target, content(file))
     return target.name
 
 
@@ -157,7 +150,8 @@ def check_runs_nothing(folder: Path, stored: dict[str, Any]) -> None:
         ValueError: naming it.
     """
     _refuse_code(folder, [stored["environment"]])
-    _refuse_code(folder, [stored["policy"]], ("torchscript", "onnx"))
+    data = [name for name, kind in FILE_KINDS.items() if not kind.is_code]
+    _refuse_code(folder, [stored["policy"]], data)
     check_run_names_nothing(placed(stored["policy"], folder))
 
 

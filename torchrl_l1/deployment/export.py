@@ -210,37 +210,13 @@ def export(
         except Exception as error:  # of the tracers, anything
             if not with_policy:
                 raise
-            why = next(iter(str(error).split("\n", 1)), "").strip() or type(error).__name__
-            why = _DECIDES if isinstance(error, GuardOnDataDependentSymNode) else why
-            other = ""
-            if module is not None and why != _DECIDES:  # else none can write it
-                better = ".pt" if module.scripts else ".pt2"
-                other = f"try {better}, or " * (format != FORMATS[better])
-            raise ValueError(
-                f"the policy cannot be written as {format} ({why}): {other}export L1 alone "
-                "(with_policy=False, --without-policy)"
-            ) from error
+            raise ValueError(_not_written(error, format, module)) from error
         worst = _compare(step, recorded, module, with_policy)
         box = robust.model.box
         reach = torch.where((box.high - box.low).isfinite(), box.high - box.low, 0.0)
         away = _compare_away(step, recorded, module, with_policy, reach, seed)
         content = written.read_bytes()
-    half = config.half_range
-    half_range = min(half) if isinstance(half, tuple) else half
-    allowed = tolerance * half_range
-    if not worst <= allowed:
-        raise ValueError(
-            f"{file} differs from the original by up to {worst:.3g} action units in {steps} steps, "
-            f"and {allowed:.3g} are allowed: a policy that draws random numbers, or that is not "
-            "made of torch's operations, cannot be exported (see with_policy, --without-policy)"
-        )
-    if not away <= _AWAY * half_range:
-        raise ValueError(
-            f"{file} is equal to the original along the recorded steps, but differs by up to "
-            f"{away:.3g} action units where these did not lead: the policy decides by what it sees "
-            "in Python or NumPy, of which only one way is written (use torch.where, or see "
-            "with_policy, --without-policy)"
-        )
+    _check_exact(file, config, worst, away, tolerance, steps)
     if lines := _looked_at(told):
         warnings.warn(
             f"the policy looks at values in Python ({'; '.join(lines)}): if it decides by them, "
@@ -257,6 +233,42 @@ def export(
         )
     write_atomically(file, content)
     return Exported(file, inputs, outputs, worst, steps, config.dt, preset, outside)
+
+
+def _not_written(error: Exception, format: str, module: ControlledStep | None) -> str:
+    """Why a policy cannot be written, and what can."""
+    why = next(iter(str(error).split("\n", 1)), "").strip() or type(error).__name__
+    why = _DECIDES if isinstance(error, GuardOnDataDependentSymNode) else why
+    other = ""
+    if module is not None and why != _DECIDES:  # else none can write it
+        better = ".pt" if module.scripts else ".pt2"
+        other = f"try {better}, or " * (format != FORMATS[better])
+    return (
+        f"the policy cannot be written as {format} ({why}): {other}export L1 alone "
+        "(with_policy=False, --without-policy)"
+    )
+
+
+def _check_exact(
+    file: Path, config: L1Config, worst: float, away: float, tolerance: float, steps: int
+) -> None:
+    """Refuse a function that differs from the original, on the recorded steps or beside them."""
+    half = config.half_range
+    half_range = min(half) if isinstance(half, tuple) else half
+    allowed = tolerance * half_range
+    if not worst <= allowed:
+        raise ValueError(
+            f"{file} differs from the original by up to {worst:.3g} action units in {steps} steps, "
+            f"and {allowed:.3g} are allowed: a policy that draws random numbers, or that is not "
+            "made of torch's operations, cannot be exported (see with_policy, --without-policy)"
+        )
+    if not away <= _AWAY * half_range:
+        raise ValueError(
+            f"{file} is equal to the original along the recorded steps, but differs by up to "
+            f"{away:.3g} action units where these did not lead: the policy decides by what it sees "
+            "in Python or NumPy, of which only one way is written (use torch.where, or see "
+            "with_policy, --without-policy)"
+        )
 
 
 def _outside(env: EnvBase) -> list[str]:

@@ -27,7 +27,7 @@ from torchrl_l1.deployment.learning import policy_transforms
 from torchrl_l1.deployment.robust_controller import RobustController
 from torchrl_l1.envs.references import making, require
 from torchrl_l1.envs.rendering import draw_poses, gif_frames, rollout_frames, write_gif
-from torchrl_l1.envs.sources import simulation_of
+from torchrl_l1.envs.vectors import simulation_of
 from torchrl_l1.experiment.l1_options import OFF
 
 SUFFIXES = (".mp4", ".gif")

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import inspect
-import json
 import pickle
 import warnings
-import zipfile
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key_list
@@ -24,18 +20,26 @@ from torchrl.envs import EnvBase, TensorDictPrimer
 from torchrl.modules.utils import get_primers_from_module
 
 from torchrl_l1.control import L1Controller
+from torchrl_l1.deployment.policy_files import (
+    FILE_KINDS,
+    StableBaselinesPolicy,
+    check_spaces,
+    moments,
+)
 from torchrl_l1.envs import load_attribute
-from torchrl_l1.envs.references import require
 from torchrl_l1.experiment.checkpoints import kept_by
 from torchrl_l1.experiment.evaluate import load_run
 
 Policy: TypeAlias = str | TensorDictModuleBase | nn.Module | Callable[[Tensor], Any]
 """A source, a TorchRL module, a model of Stable-Baselines3, or a function of the observation."""
 
-NO_NORMALIZATION = "none"
-"""In place of the file of VecNormalize: there is one, and it is to be left alone."""
-
-_FORMS = "sb3:FILE.zip, torchscript:FILE, onnx:FILE, MODULE:NAME, FILE.py:NAME, or a run directory"
+FORMS = ", ".join(
+    [
+        *(f"{name}:{kind.form}" for name, kind in FILE_KINDS.items()),
+        *("MODULE:NAME", "FILE.py:NAME", "or a run directory"),
+    ]
+)
+"""What sources there are, in words."""
 
 
 class FunctionPolicy(TensorDictModuleBase):
@@ -170,46 +174,6 @@ class FunctionPolicy(TensorDictModuleBase):
         return action if self.low is None else action.clamp(self.low, self.high)
 
 
-class StableBaselinesPolicy(nn.Module):
-    """The deterministic action of a policy of Stable-Baselines3, with its normalisation.
-
-    Args:
-        policy: ``model.policy``.
-        statistics: mean, variance, epsilon and clipping of VecNormalize.
-    """
-
-    low: Tensor
-    high: Tensor
-    mean: Tensor | None
-    deviation: Tensor | None
-
-    def __init__(
-        self, policy: Any, statistics: tuple[Tensor, Tensor, float, float] | None = None
-    ) -> None:
-        super().__init__()
-        policy.set_training_mode(False)
-        self.policy = policy
-        self.squashed = bool(policy.squash_output)
-        self.dtype = torch.float32
-        space = policy.action_space
-        self.register_buffer("low", torch.as_tensor(space.low))
-        self.register_buffer("high", torch.as_tensor(space.high))
-        mean, variance, epsilon, self.clip = statistics or (None, None, 0.0, 0.0)
-        self.register_buffer("mean", mean)
-        deviation = None if variance is None else (variance + epsilon).sqrt()
-        self.register_buffer("deviation", deviation)
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """Actions ``(N, m)`` for raw observations ``(N, n)``."""
-        if self.mean is not None and self.deviation is not None:
-            scaled = (observation - self.mean) / self.deviation
-            observation = scaled.clamp(-self.clip, self.clip)
-        action = self.policy._predict(observation.to(self.dtype), deterministic=True)
-        if self.squashed:
-            return self.low + 0.5 * (action + 1.0) * (self.high - self.low)
-        return torch.maximum(torch.minimum(action, self.high), self.low)
-
-
 def _close(one: Tensor, other: Tensor) -> bool:
     return torch.allclose(one.double(), other.double(), 1e-4, 1e-5, equal_nan=True)
 
@@ -265,9 +229,9 @@ def load_policy(
     predicts = getattr(found, "predict", None)
     if callable(predicts) and hasattr(getattr(found, "policy", None), "squash_output"):
         # A model of Stable-Baselines3, which knows the normaliser that it was trained behind.
-        _check_spaces(found.policy)
+        check_spaces(found.policy)
         found = StableBaselinesPolicy(
-            found.policy, _moments(getattr(found, "get_vec_normalize_env", lambda: None)())
+            found.policy, moments(getattr(found, "get_vec_normalize_env", lambda: None)())
         )
     if weights is not None:
         if not isinstance(found, nn.Module):
@@ -294,7 +258,7 @@ def load_policy(
         _check_keys(found, env)
         return found
     if not callable(found):
-        raise ValueError(f"a {type(found).__name__} is no policy; policies are {_FORMS}")
+        raise ValueError(f"a {type(found).__name__} is no policy; policies are {FORMS}")
     action = env.full_action_spec["action"]
     if isinstance(found, StableBaselinesPolicy):
         _warn_of_bounds(found, action)
@@ -346,13 +310,11 @@ def _short(error: Exception) -> str:
 
 def _from_source(source: str, normalization: str | None, search_path: Sequence[str]) -> Any:
     kind, _, rest = source.partition(":")
-    if kind in _FILES and rest:
+    if kind in FILE_KINDS and rest:
         if not Path(rest).is_file():
             raise FileNotFoundError(f"there is no file {rest}")
         try:
-            if kind == "sb3":
-                return _stable_baselines(Path(rest), normalization)
-            return _FILES[kind](rest)
+            return FILE_KINDS[kind].read(Path(rest), normalization)
         except (ValueError, ImportError, FileNotFoundError):
             raise
         except Exception as error:  # of a foreign file, anything
@@ -360,7 +322,7 @@ def _from_source(source: str, normalization: str | None, search_path: Sequence[s
     if Path(source).is_dir() or (kept_by(Path(source)) and Path(source).is_file()):
         return list(load_run(source).algorithm.policies.values())[-1]
     if not rest:
-        raise ValueError(f"unknown policy {source!r}; policies are {_FORMS}")
+        raise ValueError(f"unknown policy {source!r}; policies are {FORMS}")
     return _from_code(source, search_path)
 
 
@@ -380,78 +342,6 @@ def _from_code(source: str, search_path: Sequence[str]) -> Any:
     return found if needed else found()
 
 
-def _torchscript(file: str) -> Any:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch's own, that TorchScript is no longer developed
-        return torch.jit.load(file, map_location="cpu").eval()
-
-
-def _onnx(file: str) -> Any:
-    runtime = require("onnxruntime", "onnx")
-    session = runtime.InferenceSession(file, providers=["CPUExecutionProvider"])
-    first = session.get_inputs()[0]
-    kind = np.float64 if first.type == "tensor(double)" else np.float32
-    batched = len(first.shape) > 1
-
-    def act(observation: Tensor) -> Tensor:
-        values = observation.detach().cpu().numpy().astype(kind)
-        if batched and values.ndim == 1:
-            return torch.as_tensor(session.run(None, {first.name: values[None]})[0])[0]
-        return torch.as_tensor(session.run(None, {first.name: values})[0])
-
-    return act
-
-
-_FILES: dict[str, Callable[[str], Any]] = {
-    "torchscript": _torchscript,
-    "onnx": _onnx,
-    "sb3": lambda file: _stable_baselines(Path(file), None),
-}
-
-
-def _stable_baselines(file: Path, normalization: str | None) -> StableBaselinesPolicy:
-    require("stable_baselines3", "sb3")
-    beside = _statistics(file)
-    if normalization is None and beside is not None:
-        raise ValueError(
-            f"{beside} stands beside {file.name}: give it as normalization (--normalization "
-            f"{beside}), which loads a pickle and so executes what is in it, or say "
-            f"{NO_NORMALIZATION!r} if the policy does without"
-        )
-    with zipfile.ZipFile(file) as archive:
-        home = json.loads(archive.read("data"))["policy_class"]["__module__"]
-    model = _algorithm(home).load(file, device="cpu")
-    _check_spaces(model.policy)
-    stored = None
-    if normalization not in (None, NO_NORMALIZATION):
-        with open(str(normalization), "rb") as handle:
-            stored = pickle.load(handle)
-    return StableBaselinesPolicy(model.policy, _moments(stored))
-
-
-def _statistics(file: Path) -> Path | None:
-    """A file that is named like VecNormalize's, beside a model or in the folder of its name."""
-    found = [
-        one
-        for folder in (file.parent, file.with_suffix(""))
-        for one in folder.glob("*.pkl")
-        if "vecnorm" in one.name.lower().replace("_", "").replace("-", "")
-    ]
-    # CheckpointCallback writes one for each of its models, named alike.
-    found.sort(key=lambda one: (one.stem.replace("vecnormalize_", "") != file.stem, one))
-    return found[0] if found else None
-
-
-def _check_spaces(policy: Any) -> None:
-    """Refuse a policy of Stable-Baselines3 that is none of vectors, before its inside is read."""
-    for what, space in (("reads", policy.observation_space), ("acts in", policy.action_space)):
-        if not isinstance(space, Box) or len(space.shape) != 1:
-            raise ValueError(
-                f"the policy {what} {space}: it must read and give vectors of numbers, each a Box "
-                "of one dimension; wrap what joins or splits them as a function of the observation"
-            )
-
-
 def _warn_of_bounds(policy: StableBaselinesPolicy, action: TensorSpec) -> None:
     """Say that a policy acts in other units than the environment, as far as bounds tell."""
     if not isinstance(action, Bounded) or policy.low.shape != action.shape[-1:]:
@@ -469,29 +359,3 @@ def _warn_of_bounds(policy: StableBaselinesPolicy, action: TensorSpec) -> None:
             "between them, let the function that makes the environment add it",
             stacklevel=3,
         )
-
-
-def _moments(normalize: Any) -> tuple[Tensor, Tensor, float, float] | None:
-    """Mean, variance, epsilon and clipping of VecNormalize, if it normalises observations."""
-    if normalize is None or not normalize.norm_obs:
-        return None
-    return (
-        torch.as_tensor(normalize.obs_rms.mean, dtype=torch.float64),
-        torch.as_tensor(normalize.obs_rms.var, dtype=torch.float64),
-        float(normalize.epsilon),
-        float(normalize.clip_obs),
-    )
-
-
-def _algorithm(home: str) -> Any:
-    """The class of the model, from the module that its policy's class is of."""
-    package, *inner = home.split(".")
-    if package in ("stable_baselines3", "sb3_contrib") and inner[0] != "common":
-        algorithms = import_module(f"{package}.{inner[0]}")
-        return next(
-            value
-            for name, value in vars(algorithms).items()
-            if name.lower() == inner[0].lower() and inspect.isclass(value)
-        )
-    # Of algorithms whose policies are the common ones the class makes no difference.
-    return import_module("stable_baselines3").PPO

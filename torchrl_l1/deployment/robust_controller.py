@@ -21,7 +21,6 @@ from torchrl_l1.control import L1Config, L1Transform
 from torchrl_l1.deployment.assessment import Assessment, Disturbances, assess
 from torchrl_l1.deployment.controller_folder import (
     FILE,
-    FILE_KINDS,
     FORMAT,
     MODEL,
     check_files,
@@ -36,6 +35,7 @@ from torchrl_l1.deployment.controller_folder import (
 )
 from torchrl_l1.deployment.learning import policy_transforms
 from torchrl_l1.deployment.policies import Policy, load_policy
+from torchrl_l1.deployment.policy_files import FILE_KINDS
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.envs import EnvironmentSource, environment_source, vector_environment
 from torchrl_l1.envs.references import folders_of
@@ -168,7 +168,7 @@ class RobustController:
         files = [MODEL]
         kind, _, file = str(origin.get("policy") or "").partition(":")
         if kind in FILE_KINDS:
-            files.append(copied(Path(file), folder, "policy", kind))
+            files.append(copied(Path(file), folder, "policy", FILE_KINDS[kind].content))
             origin["policy"] = f"{kind}:{files[-1]}"
         named = [name for name in (self.source.name, origin.get("policy")) if name]
         folders = [*(origin.get("search_path") or ()), *folders_of(named, [Path.cwd()])]

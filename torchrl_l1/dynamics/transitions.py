@@ -273,8 +273,7 @@ def _read(
     device: torch.device | None,
 ) -> TensorDict:
     """What is needed of a tensordict, flat, and what is known of each row."""
-    shape, steps = data.shape, data.shape[-1]
-    next_key = _after(observation_key)
+    shape, next_key = data.shape, _after(observation_key)
 
     def vectors(key: NestedKey, option: str) -> Tensor:
         values = _entry(data, key, option).detach()
@@ -296,6 +295,21 @@ def _read(
             f"{_name(observation_key)} has {observation.shape[-1]} entries, {_name(next_key)} "
             f"{following.shape[-1]}: they must be observations of one kind"
         )
+    return TensorDict(
+        {
+            "observation": observation,
+            "action": action,
+            "next": {"observation": following},
+            **_known_of_rows(data, observation, following),
+        },
+        batch_size=[len(observation)],
+    )
+
+
+def _known_of_rows(
+    data: TensorDictBase, observation: Tensor, following: Tensor
+) -> dict[str, Tensor]:
+    """Which rows the next one continues, which are to be learned from, and of what episode."""
     here = observation.device
 
     def flag(*keys: NestedKey) -> Tensor | None:
@@ -315,7 +329,7 @@ def _read(
     # A row of a batch is followed by no other, nor is the last one.
     meets = none.clone()
     meets[:-1] = (following[:-1] == observation[1:]).all(-1)
-    meets &= (torch.arange(len(meets), device=here) + 1) % max(steps, 1) != 0
+    meets &= (torch.arange(len(meets), device=here) + 1) % max(data.shape[-1], 1) != 0
     told = ids is not None or first is not None
     goes_on = ~none if told else none.clone()
     if ids is not None:
@@ -337,19 +351,13 @@ def _read(
     trajectory = starts.cumsum(0) - 1
     if ids is not None:
         trajectory = ids.unique(return_inverse=True)[1]
-    return TensorDict(
-        {
-            "observation": observation,
-            "action": action,
-            "next": {"observation": following},
-            "joined": joined,
-            "real": real,
-            "reset": (across | spent) & real,
-            "trajectory": trajectory,
-            "validation": none if held_out is None else held_out,
-        },
-        batch_size=[len(observation)],
-    )
+    return {
+        "joined": joined,
+        "real": real,
+        "reset": (across | spent) & real,
+        "trajectory": trajectory,
+        "validation": none if held_out is None else held_out,
+    }
 
 
 def _entry(data: TensorDictBase, key: NestedKey, option: str) -> Tensor:

@@ -41,9 +41,10 @@ from torchrl_l1.envs.references import (
 )
 from torchrl_l1.envs.sensors import SensorBias, SensorDelay, SensorDropout
 from torchrl_l1.envs.simulation import BatchedSimulator, StartStates, TaskSimulation
-from torchrl_l1.envs.sources import EnvironmentSource, environment_source, vector_environment
+from torchrl_l1.envs.sources import EnvironmentSource, environment_source
 from torchrl_l1.envs.task import AnyTask, BadAction, Task, action_bounds
 from torchrl_l1.envs.tasks import TASKS
+from torchrl_l1.envs.vectors import vector_environment
 from torchrl_l1.registration import gymnasium_id, register_tasks
 
 register_tasks()

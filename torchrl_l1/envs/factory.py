@@ -24,9 +24,10 @@ from torchrl_l1.envs.perturbations import (
     warn_of_late,
 )
 from torchrl_l1.envs.plant import does_nothing
-from torchrl_l1.envs.sources import EnvironmentSource, simulation_of
+from torchrl_l1.envs.sources import EnvironmentSource
 from torchrl_l1.envs.task import AnyTask, Task
 from torchrl_l1.envs.tasks import TASKS, built_in_task, is_plain
+from torchrl_l1.envs.vectors import simulation_of
 
 
 def get_task(

@@ -21,7 +21,7 @@ from torchrl.envs.utils import step_mdp
 from torchrl_l1.checks import LARGEST_BOUND
 from torchrl_l1.control import repeats, time_step
 from torchrl_l1.envs.known_rewards import Outcome, known_outcome
-from torchrl_l1.envs.sources import (
+from torchrl_l1.envs.vectors import (
     check_keys,
     innermost,
     parts_left_out,

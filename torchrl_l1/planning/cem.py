@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrl_l1.checks import check_counts, check_not_negative, check_positive, check_within
-from torchrl_l1.dynamics.imagination import finite_bounds
+from torchrl_l1.dynamics.functions import finite_bounds
 from torchrl_l1.planning.sequences import (
     Evaluate,
     Plan,

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchrl_l1.dynamics.imagination import RewardFunction, Termination, one_each
+from torchrl_l1.dynamics.functions import RewardFunction, Termination, one_each
 from torchrl_l1.dynamics.network import ForwardPass, PlanningNetwork
 
 Scenarios = tuple[Tensor, Tensor]

@@ -14,7 +14,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
 from torchrl_l1.checks import check_count
-from torchrl_l1.dynamics.imagination import finite_bounds
+from torchrl_l1.dynamics.functions import finite_bounds
 from torchrl_l1.planning import cem, mppi, random_shooting
 from torchrl_l1.planning.cem import CEMConfig
 from torchrl_l1.planning.mppi import MPPIConfig

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from torchrl_l1.dynamics.imagination import untouched
+from torchrl_l1.dynamics.functions import untouched
 
 Evaluate = Callable[[Tensor], Tensor]
 """Returns ``(N, C)`` of candidate action sequences ``(N, C, H, m)``."""

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl_l1.checks import check_choice, check_count, check_optional_count, check_within
 from torchrl_l1.compilation import CompileMode
 from torchrl_l1.dynamics import EnsembleDynamics
-from torchrl_l1.dynamics.imagination import RewardFunction, Termination
+from torchrl_l1.dynamics.functions import RewardFunction, Termination
 from torchrl_l1.dynamics.network import (
     PlanningNetwork,
     Precision,
