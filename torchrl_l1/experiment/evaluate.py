@@ -257,7 +257,7 @@ def check_plants(task: AnyTask, cells: Sequence[Condition]) -> None:
         return
     for cell in cells:
         changed = disturbed(cell.disturbances)
-        task.check_disturbances([n for n in changed if DISTURBANCES[n].acts_on == "plant"])
+        task.check_disturbances([n for n in changed if DISTURBANCES[n].of_plant])
 
 
 def check_controllers(own: L1Settings, task: AnyTask, cells: Sequence[Condition]) -> None:
