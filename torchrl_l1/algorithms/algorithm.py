@@ -318,7 +318,7 @@ class Algorithm(ABC):
 
     def _calibrate_filter(self) -> None:
         """Where a Kalman filter acts, fit it to what the model misses now."""
-        if self.l1 is None or self.l1.filter != "kalman":
+        if self.l1 is None or not self.l1.needs_calibration:
             return
         residuals = self.acting_dynamics.residuals
         config = replace(

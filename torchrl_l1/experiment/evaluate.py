@@ -23,6 +23,7 @@ from torchrl_l1.algorithms.collection import (
 )
 from torchrl_l1.algorithms.policy import kinds_of
 from torchrl_l1.control import L1Config
+from torchrl_l1.control.config import follows_input
 from torchrl_l1.dynamics import calibrate_filter
 from torchrl_l1.dynamics.validation import one_step_residuals
 from torchrl_l1.envs import (
@@ -344,7 +345,7 @@ def _follows(trained: TrainedRun, cell: Condition) -> bool:
     if cell.l1 in UNTUNED:
         return False
     settings = _tested_l1(trained.recipe.l1, trained.algorithm.task, cell)
-    return settings.filter == "kalman"
+    return follows_input(settings.filter)
 
 
 def _tested_l1(own: L1Settings, task: AnyTask, cell: Condition) -> L1Settings:

@@ -9,7 +9,7 @@ from functools import cache
 from typing import Any
 
 from torchrl_l1.algorithms.collection import ORACLE
-from torchrl_l1.control.config import DEFAULT_ALPHA
+from torchrl_l1.control.config import DEFAULT_ALPHA, follows_input
 from torchrl_l1.envs import AnyTask
 from torchrl_l1.envs.tasks import is_plain
 from torchrl_l1.experiment.recipes import group_options, group_setting
@@ -48,13 +48,13 @@ def l1_option(name: str) -> L1Settings:
 
 
 def is_tuned(name: str) -> bool:
-    """Whether epsilon and alpha say something to what a test names: to low-pass filters.
+    """Whether epsilon and alpha say something to what a test names.
 
     Examples:
         >>> is_tuned("paper"), is_tuned("robust"), is_tuned("oracle")
         (True, False, False)
     """
-    return name not in UNTUNED and l1_options()[name].filter != "kalman"
+    return name not in UNTUNED and not follows_input(l1_options()[name].filter)
 
 
 def check_tested(names: Iterable[str]) -> None:
