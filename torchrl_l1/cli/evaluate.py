@@ -152,7 +152,7 @@ def write_filmstrip(
         )
         return []
     several = len({cell.stage for cell in cells}) > 1
-    steps = min(trained.recipe.horizon or task.horizon, round(_SECONDS_SHOWN / task.dt))
+    steps = min(trained.algorithm.horizon, round(_SECONDS_SHOWN / task.dt))
     try:
         rows = {
             _label(cell, several): rollout_frames(task, _poses(trained, cell, steps, seed))

@@ -288,7 +288,7 @@ def reachable(trained: TrainedRun, cells: Sequence[Condition]) -> list[Condition
         source = task.source
     else:
         return list(cells)
-    can_act = acting_on(source, trained.recipe.horizon or task.horizon)
+    can_act = acting_on(source, trained.algorithm.horizon)
     return [cell for cell in cells if can_act(disturbed(cell.disturbances))]
 
 
