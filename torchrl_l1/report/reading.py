@@ -25,7 +25,14 @@ from torchrl_l1.experiment.matrix import Condition, axes
 SWITCH_RATE = "l1/switch_rate"
 """Column of the switches per step."""
 
-SIGNALS = (SWITCH_RATE, "l1/u_a", "l1/saturation")
+L1_COLUMNS = {
+    "switches_per_1000": (SWITCH_RATE, 1000),
+    "u_a": ("l1/u_a", 1),
+    "saturation": ("l1/saturation", 1),
+}
+"""Columns of a report's tables, with the signal that each shows and a factor."""
+
+SIGNALS = tuple(signal for signal, _ in L1_COLUMNS.values())
 """Columns of a metrics table that only runs with L1 have."""
 
 AGAIN = "Move the run directory away, or run it again"
