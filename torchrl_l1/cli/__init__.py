@@ -108,7 +108,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         # Behind an option argparse knows no more of them.
         options.overrides += rest
     # Imports wait until the arguments are known to be right: torch takes seconds to load.
-    from torchrl_l1.experiment.signals import orderly_end
+    from torchrl_l1.experiment.shutdown import orderly_end
 
     with orderly_end():
         _dispatch(options, rest)

@@ -22,7 +22,7 @@ UNTUNED = (OFF, ORACLE)
 """What a test may name in place of a controller that epsilon and alpha could tune."""
 
 # What runs are tuned by; it makes no other controller.
-_TUNED = ("enabled", "epsilon", "compile")
+_NO_OPTION = ("enabled", "epsilon", "compile")
 # Two ways to give one number.
 _FILTER = ("alpha", "cutoff")
 
@@ -109,7 +109,7 @@ def departures(settings: L1Settings, option: str, task: str | AnyTask) -> dict[s
     shipped = l1_options()[option]
     found = {
         name: getattr(settings, name)
-        for name in (f.name for f in fields(L1Settings) if f.name not in (*_TUNED, *_FILTER))
+        for name in (f.name for f in fields(L1Settings) if f.name not in (*_NO_OPTION, *_FILTER))
         if getattr(settings, name) != getattr(shipped, name)
     }
     gain = filter_gain(settings, task)

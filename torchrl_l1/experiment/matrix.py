@@ -47,7 +47,7 @@ class Axis:
     choices: tuple[str, ...] = ()
 
 
-def _varied(
+def _axis(
     kind: type[str] | type[float],
     help: str,
     values: Iterable[Any] = (),
@@ -83,27 +83,27 @@ class Condition:
         ['paper', 'none', 0.5, 1.0, 0.3, None]
     """
 
-    l1: str = _varied(
+    l1: str = _axis(
         str,
         f"settings of the l1 group, or {ORACLE}, which is told the matched disturbances",
         (OFF, "paper"),
     )
-    noise: str = _varied(str, "settings of the noise group", ("none",), default="none")
+    noise: str = _axis(str, "settings of the noise group", ("none",), default="none")
     disturbances: Mapping[str, float] = field(default_factory=dict, hash=False)
-    policy: str = _varied(
+    policy: str = _axis(
         str,
         "sampled or mean actions; both by default, and sampled ones where they are the same",
         KINDS,
         choices=KINDS,
         default=KINDS[0],
     )
-    epsilon: float | None = _varied(
+    epsilon: float | None = _axis(
         float, "tolerances of the switching law; the run's own by default", default=None
     )
-    alpha: float | None = _varied(
+    alpha: float | None = _axis(
         float, "gains of the filter per step; the controller's own by default", default=None
     )
-    stage: str | None = _varied(
+    stage: str | None = _axis(
         str,
         "stages whose policies are tested, of algorithms with several "
         f"({', '.join(_STAGES)}); "

@@ -162,7 +162,7 @@ def read_evaluations(file: Path) -> list[Evaluation]:
             )
     return [
         Evaluation(
-            **_varied(row),
+            **_condition_fields(row),
             return_mean=row["return_mean"],
             episodes=int(row["episodes"]),
             own_l1=None if math.isnan(row["own_l1"]) else bool(row["own_l1"]),
@@ -173,7 +173,7 @@ def read_evaluations(file: Path) -> list[Evaluation]:
     ]
 
 
-def _varied(row: Mapping[str, Any]) -> dict[str, Any]:
+def _condition_fields(row: Mapping[str, Any]) -> dict[str, Any]:
     """The fields of a condition."""
     words = {axis.name: row[axis.name] or None for axis in axes() if axis.kind is str}
     tuned = {name: _known(row[name]) for name in _TUNED}
