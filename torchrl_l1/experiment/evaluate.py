@@ -359,8 +359,7 @@ def _tested_l1(own: L1Settings, task: AnyTask, cell: Condition) -> L1Settings:
         settings = own
     else:
         settings = replace(l1_option(cell.l1), epsilon=own.epsilon)
-    if cell.epsilon is not None:
-        settings = replace(settings, epsilon=cell.epsilon)
-    if cell.alpha is not None:
-        settings = replace(settings, alpha=cell.alpha, cutoff=None)
-    return settings
+    tuned: dict[str, Any] = {k: v for k, v in cell.tuning.items() if v is not None}
+    if "alpha" in tuned:
+        tuned["cutoff"] = None  # two ways to give one number
+    return replace(settings, **tuned)

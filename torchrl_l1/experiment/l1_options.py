@@ -164,14 +164,13 @@ def same_controller(one: L1Settings, other: L1Settings, task: str | AnyTask) -> 
     return first == second
 
 
-def controller_label(option: str, epsilon: float | None = None, alpha: float | None = None) -> str:
+def controller_label(option: str, **values: float | None) -> str:
     """An option and what a test has set of it, as tables and figures name a controller.
 
     Examples:
-        >>> controller_label("paper", 0.3, 0.1), controller_label("off")
+        >>> controller_label("paper", epsilon=0.3, alpha=0.1), controller_label("off", alpha=None)
         ('paper epsilon=0.3 alpha=0.1', 'off')
     """
-    values = {"epsilon": epsilon, "alpha": alpha}
     return " ".join([option, *(f"{k}={v:.9g}" for k, v in values.items() if v is not None)])
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from torchrl_l1.algorithms.collection import ORACLE
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.l1_options import UNTUNED, controller_label
-from torchrl_l1.experiment.matrix import disturbance_words
+from torchrl_l1.experiment.matrix import TUNING, disturbance_words
 from torchrl_l1.report.identity import BASELINE
 from torchrl_l1.report.page import Row, grouped, markdown
 from torchrl_l1.report.reading import SWITCH_RATE
@@ -69,7 +69,7 @@ def summarize(rows: Sequence[Row], episodes: Sequence[Row] = ()) -> list[dict[st
 
 def _key(row: Row, keys: Sequence[str]) -> Key:
     neutral = {name: entry.neutral for name, entry in DISTURBANCES.items()}
-    name = controller_label(row["l1"], row.get("epsilon"), row.get("alpha"))
+    name = controller_label(row["l1"], **{axis: row.get(axis) for axis in TUNING})
     cell = {"stage": None, **neutral, **row, "l1": name}
     return tuple(cell[key] for key in keys)
 
