@@ -144,6 +144,15 @@ def test_the_memory_of_the_kalman_filter_counts():
         verify(observation, lost, seal, emitted=Emitted.of(observation, state, seal), **NAMES)
 
 
+def test_the_memory_of_any_law_counts():
+    observation, state = example()
+    state = state._replace(noise=torch.ones(3))
+    seal = sealed(observation, state)
+    assert seal.shape == (seal_width(3, 2, True),)
+    with pytest.raises(ValueError, match="'noise'"):
+        verify(observation, state._replace(noise=torch.zeros(3)), seal, **NAMES)
+
+
 def test_it_compiles_as_one_graph():
     def check(observation: Tensor, other: Tensor, *entries: Tensor) -> Tensor:
         state = L1State(*entries)

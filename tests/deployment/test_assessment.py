@@ -1,14 +1,20 @@
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 from tensordict import TensorDict
 
-from torchrl_l1.deployment import Assessment
-from torchrl_l1.deployment.assessment import single_disturbances, summarize_episodes
+from torchrl_l1.control import L1Config
+from torchrl_l1.control.config import Filter
+from torchrl_l1.deployment import Assessment, assessment
+from torchrl_l1.deployment.assessment import Episodes, single_disturbances, summarize_episodes
 from torchrl_l1.envs import suite
+from torchrl_l1.experiment import l1_options
+from torchrl_l1.experiment.settings import L1Settings
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +51,16 @@ def test_episodes_count_up_to_their_end():
     assert found.returns.tolist() == [0 + 1 + 2, 5 + 6 + 7 + 8 + 9]
     assert found.steps.tolist() == [3, 5]
     assert found.switches == pytest.approx(1000 * 2 / 8)
+
+
+@pytest.mark.parametrize("law", [*get_args(Filter), "another"])
+def test_switches_are_shown_of_the_laws_that_epsilon_tunes(law, monkeypatch):
+    settings = L1Settings(enabled=True, filter=law)
+    monkeypatch.setattr(l1_options, "l1_options", lambda: {"option": settings})
+    config = L1Config(0.05)
+    object.__setattr__(config, "filter", law)
+    columns = assessment._columns(Episodes(np.ones(2), np.ones(2), 3.0), config)
+    assert ("switches_per_1000_steps" in columns) == l1_options.is_tuned("option")
 
 
 def test_rows_are_there_for_each_disturbance_and_controller(table):

@@ -82,7 +82,7 @@ def test_chain_of_all():
         *("ObservationNoise", "SensorBias", "SensorDelay", "SensorDropout"),
     ]
     check_env_specs(env)
-    plant = [entry.name for entry in ENTRIES if entry.acts_on == "plant"]
+    plant = [entry.name for entry in ENTRIES if entry.of_plant]
     assert list(env.base_env._simulation.simulator.plant.values) == plant
 
 

@@ -172,5 +172,5 @@ def test_what_does_nothing_although_it_is_asked_for_gets_a_warning():
     with pytest.warns(UserWarning, match=r"armature 2 does nothing here: .* no inertia of rotors"):
         environment_source("gymnasium/InvertedPendulum-v5").several(1, {"armature": 2.0})
     model = TASKS["swimmer"].build_model()
-    plant = {n: e.neutral for n, e in DISTURBANCES.items() if e.acts_on == "plant" and n != "wind"}
+    plant = {n: e.neutral for n, e in DISTURBANCES.items() if e.of_plant and n != "wind"}
     disturbed_model(model, plant)  # without one

@@ -8,7 +8,7 @@ import pytest
 import torch
 from gymnasium.wrappers import TransformReward
 
-from torchrl_l1.envs.known_rewards import known_names, known_outcome
+from torchrl_l1.envs.known_rewards import _BUILDERS, known_outcome
 
 EXACT = [
     ("Pendulum-v1", {}),
@@ -84,7 +84,7 @@ def test_terminations_occur_in_what_is_compared():
 
 def test_every_known_class_is_compared():
     compared = {type(gymnasium.make(name).unwrapped).__name__ for name, _ in EXACT + NEARLY}
-    known = {name.rpartition(".")[2] for name in known_names()}
+    known = {name.rpartition(".")[2] for name in _BUILDERS}
     assert known == compared
 
 

@@ -25,7 +25,7 @@ from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.run_directory import RunDirectory
-from torchrl_l1.experiment.signals import RESUME_ME, orderly_end
+from torchrl_l1.experiment.shutdown import RESUME_ME, orderly_end
 from torchrl_l1.objectives import NonFiniteAdvantages
 from torchrl_l1.objectives.gaussian_trpo import _GaussianProblem
 from torchrl_l1.report import report

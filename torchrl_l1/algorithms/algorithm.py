@@ -10,7 +10,7 @@ from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import partial
 from time import perf_counter
-from typing import Any, ClassVar, Protocol, TypedDict
+from typing import Any, ClassVar, Protocol, TypedDict, TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -28,6 +28,8 @@ from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import FitConfig, calibrate_filter, make_dynamics
 from torchrl_l1.dynamics.network import model_precision
 from torchrl_l1.envs import AnyTask, BadAction, Perturbation, get_task
+
+_Module = TypeVar("_Module", bound=nn.Module)
 
 DEVICES = ("cpu", "cuda", "auto")
 """Where models may be fitted and trajectories imagined."""
@@ -229,8 +231,7 @@ class Algorithm(ABC):
             device=self.device,
             search_path=search_path,
         )
-        on_cpu = self.device.type == "cpu"
-        self.acting_dynamics = self.dynamics if on_cpu else deepcopy(self.dynamics).cpu()
+        self.acting_dynamics = self._on_cpu(self.dynamics)
         self.real = partial(
             Collection,
             self.task,
@@ -239,6 +240,10 @@ class Algorithm(ABC):
             perturbation=perturbation or Perturbation(),
             compile_l1=compile_l1,
         )
+
+    def _on_cpu(self, module: _Module) -> _Module:
+        """What acts in real environments: the module, or a copy where it is on another device."""
+        return module if self.device.type == "cpu" else deepcopy(module).cpu()
 
     def make_learning(self, capacity: int) -> ModelLearning:
         """Data with room for so many real transitions, and the fits of the model to them."""
@@ -318,7 +323,7 @@ class Algorithm(ABC):
 
     def _calibrate_filter(self) -> None:
         """Where a Kalman filter acts, fit it to what the model misses now."""
-        if self.l1 is None or self.l1.filter != "kalman":
+        if self.l1 is None or not self.l1.needs_calibration:
             return
         residuals = self.acting_dynamics.residuals
         config = replace(

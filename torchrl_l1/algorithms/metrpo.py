@@ -9,7 +9,6 @@ the algorithm does not know of it (arXiv 2403.14860, algorithm 2).
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from copy import deepcopy
 from functools import partial
 from typing import Any, Unpack
 
@@ -96,8 +95,7 @@ class METRPO(Algorithm):
         self.improvement = PolicyImprovement(
             self.task, self.dynamics, self.policy, config, self.outcomes
         )
-        on_cpu = self.device.type == "cpu"
-        self.acting_policy = self.policy if on_cpu else deepcopy(self.policy).cpu()
+        self.acting_policy = self._on_cpu(self.policy)
         real = partial(self.real, policy=acting(self.acting_policy, self.task, config.clip_actions))
         self.collection = real(episodes=config.episodes_per_iteration, horizon=self.episode_steps)
         self.evaluation = real(episodes=config.evaluation_episodes, horizon=self.horizon)

@@ -10,7 +10,6 @@ nothing else, augments its actions there: the future work of arXiv 2403.14860.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from copy import deepcopy
 from typing import Any, Unpack
 
 import torch
@@ -152,8 +151,7 @@ class Offline(Algorithm):
         self.improvement = PolicyImprovement(
             self.task, self.dynamics, self.policy, config, self.outcomes, self.pessimism
         )
-        on_cpu = self.device.type == "cpu"
-        self.acting_policy = self.policy if on_cpu else deepcopy(self.policy).cpu()
+        self.acting_policy = self._on_cpu(self.policy)
         self.evaluation = self.real(
             policy=acting(self.acting_policy, self.task),
             episodes=config.evaluation_episodes,

@@ -59,7 +59,7 @@ def train(settings: Mapping[str, Any]) -> None:
     from torchrl_l1.experiment.errors import USER_ERRORS, RunDirectoryInUse, message
     from torchrl_l1.experiment.run import run
     from torchrl_l1.experiment.settings import schema_of
-    from torchrl_l1.experiment.signals import orderly_end
+    from torchrl_l1.experiment.shutdown import orderly_end
 
     config = OmegaConf.merge(OmegaConf.structured(schema_of(settings)), dict(settings))
     assert isinstance(config, DictConfig)

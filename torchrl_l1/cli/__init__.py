@@ -23,6 +23,12 @@ _NEGATIVE = re.compile(r"-(?:\.?\d|inf\b|nan\b)", re.IGNORECASE)
 
 _LATER = (
     (
+        "evaluate",
+        "evaluate trained policies with L1 on and off under noise and disturbances",
+        "Frozen policy and model, every combination of L1 and its tuning, noise, disturbance and "
+        "stochastic or deterministic policy. Several run directories are seeds of one study.",
+    ),
+    (
         "new-task",
         "write a recipe for an environment of yours",
         "Reads what an environment tells and writes a commented recipe for it.",
@@ -68,7 +74,6 @@ def main(argv: Sequence[str] | None = None) -> None:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _run_parser(commands)
     _campaign_parser(commands)
-    _evaluate_parser(commands, asked="evaluate" in arguments[:1])
     for name, words, description in _LATER:
         parts = commands.add_parser(name, help=words, description=description)
         # What their options come with is heavy; no other command should wait for it.
@@ -103,7 +108,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         # Behind an option argparse knows no more of them.
         options.overrides += rest
     # Imports wait until the arguments are known to be right: torch takes seconds to load.
-    from torchrl_l1.experiment.signals import orderly_end
+    from torchrl_l1.experiment.shutdown import orderly_end
 
     with orderly_end():
         _dispatch(options, rest)
@@ -132,10 +137,6 @@ def _dispatch(options: argparse.Namespace, rest: list[str]) -> None:
             from torchrl_l1.campaign.command import campaign_command
 
             campaign_command(options, rest)
-        elif options.command == "evaluate":
-            from torchrl_l1.cli.evaluate import evaluate_command
-
-            evaluate_command(options)
         elif options.command in [name for name, *_ in _LATER]:
             name = _module(options.command)
             getattr(import_module(f"torchrl_l1.cli.{name}"), f"{name}_command")(options)
@@ -216,23 +217,6 @@ def _campaign_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
     )
     add("--trust", action="store_true", help=_TRUST)
     add("--launcher", help="hand the runs to one of Hydra's launchers, such as joblib")
-
-
-def _evaluate_parser(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser], asked: bool
-) -> None:
-    evaluate = commands.add_parser(
-        "evaluate",
-        help="evaluate trained policies with L1 on and off under noise and disturbances",
-        description="Frozen policy and model, every combination of L1 and its tuning, noise, "
-        "disturbance and stochastic or deterministic policy. Several run directories are seeds of "
-        "one study.",
-    )
-    # They come with all that evaluates and draws; no other command should wait for it.
-    if asked:
-        from torchrl_l1.cli.evaluate import add_arguments
-
-        add_arguments(evaluate)
 
 
 def _report_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

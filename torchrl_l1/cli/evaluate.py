@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from torchrl_l1.envs.rendering import (
     filmstrip,
     rollout_frames,
 )
-from torchrl_l1.experiment.checkpoints import CheckpointSettings
 from torchrl_l1.experiment.evaluate import (
     TrainedRun,
     check_controllers,
@@ -43,7 +41,7 @@ from torchrl_l1.experiment.matrix import (
 )
 from torchrl_l1.experiment.provenance import same_code_in
 from torchrl_l1.experiment.recipes import group_setting
-from torchrl_l1.experiment.settings import RunSettings, WandbSettings
+from torchrl_l1.experiment.settings import VOLATILE_KEYS
 from torchrl_l1.experiment.tracking import Evaluated, log_evaluation
 from torchrl_l1.report.evaluation_figures import RANGES, plot_disturbances
 from torchrl_l1.report.evaluation_summary import summarize, summary_tables
@@ -154,7 +152,7 @@ def write_filmstrip(
         )
         return []
     several = len({cell.stage for cell in cells}) > 1
-    steps = min(trained.recipe.horizon or task.horizon, round(_SECONDS_SHOWN / task.dt))
+    steps = min(trained.algorithm.horizon, round(_SECONDS_SHOWN / task.dt))
     try:
         rows = {
             _label(cell, several): rollout_frames(task, _poses(trained, cell, steps, seed))
@@ -191,18 +189,9 @@ def _poses(trained: TrainedRun, cell: Condition, steps: int, seed: int) -> np.nd
 def _check_one_study(runs: Sequence[TrainedRun]) -> None:
     """Runs may differ in their seed and in nothing that matters."""
 
-    def settings(trained: TrainedRun) -> RunSettings:
-        return replace(
-            trained.recipe,
-            seed=0,
-            run_dir="",
-            search_path=[],
-            resume=False,
-            wandb=WandbSettings(),
-            on_divergence="stop",
-            loggers=[],
-            checkpoint=CheckpointSettings(),
-        )
+    def settings(trained: TrainedRun) -> dict[str, Any]:
+        told = vars(trained.recipe).items()
+        return {key: value for key, value in told if key not in (*VOLATILE_KEYS, "seed")}
 
     for number, trained in enumerate(runs):
         for other in runs[:number]:

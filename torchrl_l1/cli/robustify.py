@@ -146,7 +146,7 @@ def _check_disturbances(env: str, disturbances: Mapping[str, Sequence[float]]) -
     for name, values in disturbances.items():
         for value in values:
             check_disturbance(name, value, prefix="--")
-    plant = {n: v[0] for n, v in disturbances.items() if DISTURBANCES[n].acts_on == "plant"}
+    plant = {n: v[0] for n, v in disturbances.items() if DISTURBANCES[n].of_plant}
     if plant:
         environment_source(env).several(1, plant).close()
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrl_l1.compilation import CompileMode, compiled
 from torchrl_l1.control import kalman_law, law
-from torchrl_l1.control.config import L1Config
+from torchrl_l1.control.config import Filter, L1Config
 from torchrl_l1.control.jacobian import ActionJacobian
 from torchrl_l1.control.probe import FORWARD_MODE, probe_covariance, warn_of_residuals
 from torchrl_l1.control.signals import (
@@ -34,6 +34,7 @@ units and six actions are 8 MB. With fewer, a small model would only wait for th
 """
 
 Step = tuple[Tensor, L1State, L1Diagnostics | None]
+Silent = tuple[Tensor, L1State, Callable[[], L1Diagnostics]]
 StepFunction = Callable[[L1State, Tensor, Tensor], Step]
 """A step of L1: executed input, next state and, if they are computed, diagnostics."""
 
@@ -193,11 +194,20 @@ def augment_silently(
     state: L1State,
     observation: Tensor,
     u_rl: Tensor,
-) -> tuple[Tensor, L1State, Callable[[], L1Diagnostics]]:
+) -> Silent:
     """:func:`augment` with the diagnostics as a function, which need not be called."""
     config.check_dimensions(state.x_hat.shape[-1], state.q.shape[-1])
-    if config.filter == "kalman":
-        return _augment_kalman(config, model, state, observation, u_rl)
+    return _LAWS[config.filter](config, model, state, observation, u_rl)
+
+
+def _augment_low_pass(
+    config: L1Config,
+    model: ActionJacobian,
+    state: L1State,
+    observation: Tensor,
+    u_rl: Tensor,
+) -> Silent:
+    """:func:`augment_silently` with the paper's law."""
     u_rl = saturate(config, u_rl)
     u_bar = torch.where(state.started, state.u_bar, u_rl)
     fresh = ~state.started
@@ -245,8 +255,8 @@ def _augment_kalman(
     state: L1State,
     observation: Tensor,
     u_rl: Tensor,
-) -> tuple[Tensor, L1State, Callable[[], L1Diagnostics]]:
-    """As :func:`augment_silently`: here the input is known before the model is expanded, at it."""
+) -> Silent:
+    """:func:`augment_silently` where the input is known before the model is expanded, at it."""
     u_rl = saturate(config, u_rl)
     # What the last step expected does not depend on where this one is.
     known = model.residual_statistics(observation, u_rl, "residuals")
@@ -264,6 +274,12 @@ def _augment_kalman(
         u_bar=u_bar.masked_fill(terms.non_finite, 0.0), n_switch=state.n_switch + state.started
     )
     return u, following, partial(diagnose, config, terms, state.started)
+
+
+_LAWS: dict[Filter, Callable[..., Silent]] = {
+    "low_pass": _augment_low_pass,
+    "kalman": _augment_kalman,
+}
 
 
 def _tested_input(
@@ -315,7 +331,8 @@ def make_step(
     known = ("residual_statistics", "residual_covariance")
     is_known = any(callable(getattr(model.dynamics, name, None)) for name in known)
     if config.needs_covariance and not is_known:
-        setting = "estimator='weighted'" if config.estimator == "weighted" else "filter='kalman'"
+        weighted = config.estimator == "weighted"
+        setting = "estimator='weighted'" if weighted else f"filter={config.filter!r}"
         warnings.warn(
             f"{setting} knows no covariance of {type(model.dynamics).__name__}'s residuals and "
             "takes the identity: give the model a residual_covariance(observation, action), or fit "
@@ -350,10 +367,10 @@ def _prepared(step: StepFunction, config: L1Config, model: ActionJacobian) -> St
                     observation,
                     action,
                     is_whole=config.estimator == "weighted",
-                    is_late=config.filter == "kalman" and config.covariance == "residuals",
+                    is_late=config.covariance_is_late,
                 )
-                has_inflation = config.filter != "kalman" or config.inflation is not None
-                warn_of_residuals(model.dynamics, is_calibrated=has_inflation)
+                is_calibrated = not config.needs_calibration or config.inflation is not None
+                warn_of_residuals(model.dynamics, is_calibrated=is_calibrated)
             is_checked = True
             return step(state, observation, u_rl)
 

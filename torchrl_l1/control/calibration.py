@@ -92,7 +92,7 @@ def calibrate(
         >>> calibrate(config, white, torch.ones(64, 100, 2, 1), 0.01 * torch.eye(2)).inflation
         1.0
     """
-    if config.filter != "kalman":
+    if not config.needs_calibration:
         raise ValueError("there is nothing to calibrate without filter='kalman'")
     sequences, steps, _, m = jacobian.shape
     action = jacobian.new_zeros(sequences, steps, m) if action is None else action

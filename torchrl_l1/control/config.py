@@ -39,6 +39,16 @@ _CHOICES = {
 }
 
 
+def follows_input(filter: str) -> bool:
+    """Whether the operating point follows the executed input in every step, whatever epsilon.
+
+    Examples:
+        >>> follows_input("kalman"), follows_input("low_pass")
+        (True, False)
+    """
+    return filter == "kalman"
+
+
 @dataclass(frozen=True)
 class L1Config:
     r"""Settings of the L1 adaptive controller (arXiv 2403.14860, sections 2.2 and 3.2).
@@ -181,7 +191,7 @@ class L1Config:
             raise ValueError(f"initial_deviation must be positive, got {self.initial_deviation}")
         if not 0 < self.forgetting <= 1:
             raise ValueError(f"forgetting must lie in (0, 1], got {self.forgetting}")
-        if self.filter != "kalman":
+        if not self.needs_calibration:
             if self.process_noise is not None or self.inflation is not None:
                 raise ValueError(
                     "process_noise and inflation belong to the Kalman filter: leave them out with "
@@ -280,9 +290,24 @@ class L1Config:
         return _tuple(high)[0] - _tuple(low)[0]
 
     @property
+    def follows_input(self) -> bool:
+        """Whether the operating point follows the executed input in every step."""
+        return follows_input(self.filter)
+
+    @property
+    def needs_calibration(self) -> bool:
+        """Whether ``inflation`` and ``process_noise`` matter, which a model may know of itself."""
+        return self.filter == "kalman"
+
+    @property
     def needs_covariance(self) -> bool:
         """Whether the covariance of the model's residuals matters."""
-        return self.filter == "kalman" or self.estimator == "weighted"
+        return self.needs_calibration or self.estimator == "weighted"
+
+    @property
+    def covariance_is_late(self) -> bool:
+        """Whether that covariance is asked for at the step after that of the residual."""
+        return self.filter == "kalman" and self.covariance == "residuals"
 
     @property
     def half_range(self) -> Scalars:

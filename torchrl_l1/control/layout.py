@@ -99,7 +99,7 @@ class Layout:
         """Spec of an :class:`~torchrl_l1.control.L1State` with these settings, and of its seal."""
         state = init([], self.observation_dim, self.action_dim, config, dtype=self.dtype)
         entries = {name: (value.shape[-1], value.dtype) for name, value in state.entries().items()}
-        width = seal_width(self.observation_dim, self.action_dim, state.covariance is not None)
+        width = seal_width(self.observation_dim, self.action_dim, bool(state.memory()))
         entries[SEAL] = (width, self.dtype)
         return self._composite(entries)
 

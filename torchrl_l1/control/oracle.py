@@ -177,7 +177,7 @@ class OracleTransform(Transform):
     def _check_surroundings(self) -> None:
         environment = self._environment()
         for transform in transforms_of(environment):
-            is_controller = isinstance(transform, (L1Primer, L1Transform, OracleTransform))
+            is_controller = isinstance(transform, CONTROLLERS)
             is_other = is_controller and transform is not self
             if is_other and _has_key(transform, "action_key", self.action_key):
                 raise ValueError(
@@ -200,6 +200,10 @@ class OracleTransform(Transform):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(key={self.key!r})"
+
+
+CONTROLLERS = (L1Primer, L1Transform, OracleTransform)
+"""Transforms that act against disturbances, of which two would be in each other's way."""
 
 
 def _has_key(transform: nn.Module, name: str, key: NestedKey) -> bool:

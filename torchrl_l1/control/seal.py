@@ -14,7 +14,7 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_l1.control.state import L1State
+from torchrl_l1.control.state import COMMON, L1State
 
 SEAL = "seal"
 """Name of the entry beside those of the state, see :func:`seal_width`."""
@@ -26,14 +26,14 @@ _LARGEST = 3.3e38  # in the range of float32, to which float64 may be changed
 
 
 def seal_width(observation_dim: int, action_dim: int, has_memory: bool) -> int:
-    """Number of entries of a seal: the observation, the state, and a sum of a Kalman filter's."""
+    """Number of entries of a seal: the observation, the state, and a sum of a law's memory."""
     return 2 * observation_dim + 3 * action_dim + 2 + has_memory
 
 
 def sealed(observation: Tensor, state: L1State) -> Tensor:
     """A copy of observation and state in the state's type, the caller may write to them in place.
 
-    Of a Kalman filter's memory, which is wide, it is the sum.
+    Of what only some laws remember, which is wide, it is the sum.
     """
     # Every operation counts here: at a batch of one each costs as much as a thousand sums, and
     # joining several types as much as three.
@@ -41,19 +41,12 @@ def sealed(observation: Tensor, state: L1State) -> Tensor:
     dtype = x_hat.dtype
     flags = n_switch.to(dtype), started.to(dtype)
     parts = [observation.to(dtype), x_hat, u_bar, q, sigma_m, *flags]
-    if state.covariance is not None:
-        parts.append(torch.cat(_memory(state), -1).sum(-1, keepdim=True))
+    if memory := state.memory():
+        parts.append(torch.cat(memory, -1).sum(-1, keepdim=True))
     # What is not finite is a number of its own here: whoever looks at the entries finds none.
     largest = min(torch.finfo(dtype).max, _LARGEST)
     seal = torch.cat(parts, -1).nan_to_num(0.9 * largest, largest, -largest)
     return seal.detach() if seal.requires_grad else seal
-
-
-_NARROW = L1State._fields.index("covariance")
-
-
-def _memory(state: L1State) -> list[Tensor]:
-    return [value for value in state[_NARROW:] if value is not None]
 
 
 class Emitted(NamedTuple):
@@ -147,7 +140,7 @@ def _compare(
     m, has_memory = divmod(found.shape[-1] - 2 * n - 2, 3)
     if has_memory:
         # A sum is as exact as its terms, which may be larger than it.
-        terms = found if state is None else torch.cat(_memory(state), -1)
+        terms = found if state is None else torch.cat(state.memory(), -1)
         scale = terms.abs().sum(-1).nan_to_num()
         differs[..., -1] &= (found - seal)[..., -1].abs() > 10 * _TOLERANCE * scale
     if zero_is_none:
@@ -203,8 +196,8 @@ def _lost(parts: list[bool], state: L1State | None, emitted: Emitted | None) -> 
         for name, a, b in zip(L1State._fields, read, given, strict=False)
         if a is not None and b is not None and a.shape == b.shape and not torch.equal(a, b)
     ]
-    differing = [name for name, part in zip(names[:_NARROW], parts, strict=False) if part]
-    memory = names[_NARROW:] if any(parts[_NARROW:]) else []
+    differing = [name for name, part in zip(names[:COMMON], parts, strict=False) if part]
+    memory = names[COMMON:] if any(parts[COMMON:]) else []
     return before or differing + memory or [SEAL]
 
 

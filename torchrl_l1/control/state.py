@@ -46,6 +46,14 @@ class L1State(NamedTuple):
         """Those that there are, by name."""
         return {name: value for name, value in self._asdict().items() if value is not None}
 
+    def memory(self) -> list[Tensor]:
+        """Those that only some laws have."""
+        return [value for value in self[COMMON:] if value is not None]
+
+
+COMMON = len(L1State._fields) - len(L1State._field_defaults)
+"""Number of entries that all laws have, which come first."""
+
 
 class ResidualStatistics(NamedTuple):
     """What is known of the one-step residuals of a model without disturbances.

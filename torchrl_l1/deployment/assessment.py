@@ -351,7 +351,7 @@ def _columns(found: Episodes, config: L1Config | None) -> Row:
     for what, values in (("return", found.returns), ("steps", found.steps)):
         row[f"{what}_median"] = float(median(values.tolist()))
         row[f"{what}_lowest"], row[f"{what}_highest"] = float(values.min()), float(values.max())
-    if config is not None and config.filter == "low_pass" and found.switches is not None:
+    if config is not None and not config.follows_input and found.switches is not None:
         row["switches_per_1000_steps"] = found.switches
     return row
 

@@ -21,6 +21,7 @@ from torchrl_l1.envs.perturbations import (
     ObservationNoise,
     active_disturbances,
     placed_transforms,
+    plant_values,
     warn_of_late,
 )
 from torchrl_l1.envs.plant import does_nothing
@@ -172,7 +173,7 @@ def make_env(
         "max_steps": max_steps,
         "dtype": dtype,
         "threads": threads,
-        "plant": {entry.name: value for entry, value in active if entry.transform is None},
+        "plant": plant_values(active),
     }
     if isinstance(found, Task):
         base: EnvBase = BatchedMujocoEnv(found, num_envs, **settings)
@@ -220,7 +221,7 @@ def acting_on(source: EnvironmentSource, horizon: float) -> Callable[[Mapping[st
             entry = DISTURBANCES[name]
             if not source.takes(entry) or entry.begins(value) >= horizon:
                 return False
-            if entry.acts_on == "plant" and model is not None and does_nothing(model, name, value):
+            if entry.of_plant and model is not None and does_nothing(model, name, value):
                 return False
         return True
 

@@ -73,11 +73,6 @@ def known_outcome(env: gymnasium.Env[Any, Any]) -> Outcome | None:
     return None if builder is None else builder(inner)
 
 
-def known_names() -> list[str]:
-    """The classes that :func:`known_outcome` knows, in full."""
-    return list(_BUILDERS)
-
-
 def _pendulum(env: Any) -> Outcome:
     def reward(observation: Tensor, action: Tensor, following: Tensor) -> Tensor:
         angle = torch.atan2(observation[..., 1], observation[..., 0])

@@ -168,6 +168,11 @@ class Disturbance:
         """Its name in sentences and at axes, such as ``actuator bias``."""
         return self.setting.replace("_", " ")
 
+    @property
+    def of_plant(self) -> bool:
+        """Whether it changes the plant, see :func:`disturbed_model`."""
+        return self.acts_on == "plant"
+
     def begins(self, value: Any) -> int:
         """The first step of an episode that a value of it disturbs."""
         return 0 if self.transform is None else getattr(self.transform(value), "at", 0)
@@ -178,9 +183,9 @@ class Disturbance:
         Raises:
             ValueError: naming the value.
         """
-        if self.transform is None:
+        if self.of_plant:
             check_plant(self.name, value)
-        elif value != self.neutral:
+        if self.transform is not None and value != self.neutral:
             self.transform(value)
 
 
@@ -424,11 +429,15 @@ def disturbance_transforms(**disturbances: Any) -> list[Transform]:
         ['ActuatorGain', 'ActuatorBias']
     """
     active = active_disturbances(disturbances)
-    plant = [entry.name for entry, _ in active if entry.transform is None]
-    if plant:
+    if plant := plant_values(active):
         raise ValueError(f"{', '.join(plant)}: a change of the plant is no transform, see make_env")
     actuators, sensors = placed_transforms(active)
     return [*actuators, *sensors]
+
+
+def plant_values(active: list[tuple[Disturbance, Any]]) -> dict[str, Any]:
+    """The values of those that change the plant, by name."""
+    return {entry.name: value for entry, value in active if entry.of_plant}
 
 
 def placed_transforms(

@@ -27,7 +27,8 @@ from torchrl_l1.envs.perturbations import (
     DISTURBANCES,
     Disturbance,
     active_disturbances,
-    disturbance_transforms,
+    placed_transforms,
+    plant_values,
 )
 from torchrl_l1.envs.plant import cannot_change, disturbed_model, survives_resets
 from torchrl_l1.envs.references import find_attribute, load_module, making, require
@@ -135,15 +136,14 @@ class EnvironmentSource:
 
     def _changed(self, disturbances: Mapping[str, float], **options: Any) -> EnvBase:
         env = vector_environment(self.build(**options), self.observation_keys)
-        plant = {name: v for name, v in disturbances.items() if _of_plant(DISTURBANCES[name])}
-        if plant:
+        if plant := plant_values(active_disturbances(disturbances)):
             simulation = simulation_of(env)
             simulation.model = disturbed_model(simulation.model, plant)
         return env
 
     def takes(self, disturbance: Disturbance) -> bool:
         """Whether a disturbance can act on it."""
-        if not _of_plant(disturbance) or self.task is not None:
+        if not disturbance.of_plant or self.task is not None:
             return True
         return survives_resets(disturbance.name) and simulation_of(self.build()) is not None
 
@@ -164,8 +164,7 @@ def _simulated(
     control: Sequence[Transform],
     seed: int | None,
 ) -> TransformedEnv:
-    changes = active_disturbances(disturbances)
-    plant = {entry.name: value for entry, value in changes if _of_plant(entry)}
+    plant = plant_values(active_disturbances(disturbances))
     base = BatchedMujocoEnv(task, count, seed=seed, plant=plant)
     return _perturbed(base, disturbances, control, None)
 
@@ -176,16 +175,11 @@ def _perturbed(
     control: Sequence[Transform],
     seed: int | None,
 ) -> TransformedEnv:
-    given = {name: v for name, v in disturbances.items() if not _of_plant(DISTURBANCES[name])}
-    chain = Compose(*disturbance_transforms(**given), *control)
-    env = TransformedEnv(base, chain, auto_unwrap=True)
+    actuators, sensors = placed_transforms(active_disturbances(disturbances))
+    env = TransformedEnv(base, Compose(*actuators, *sensors, *control), auto_unwrap=True)
     if seed is not None:
         env.set_seed(seed % 2**31)
     return env
-
-
-def _of_plant(disturbance: Disturbance) -> bool:
-    return disturbance.acts_on == "plant"
 
 
 def environment_source(env: MakeEnv, search_path: Sequence[str | Path] = ()) -> EnvironmentSource:

@@ -50,14 +50,9 @@ def read_dataset(source: str, columns: DatasetColumns | None = None) -> TensorDi
     columns = columns or DatasetColumns()
     path = Path(source)
     try:
-        if path.is_dir():
-            data = _folder(path)
-        elif path.suffix in _TABLES and path.is_file():
-            return _TABLES[path.suffix](path, columns)
-        elif path.is_file():
-            data = _file(path, columns)
-        else:
-            data = read_minari(source)
+        if path.is_file():
+            return _file(path, columns)
+        data = _folder(path) if path.is_dir() else read_minari(source)
     except (ModuleNotFoundError, TypeError) as error:
         raise ValueError(str(error)) from error
     return _named(source, data, columns)
@@ -79,11 +74,9 @@ def is_minari_name(text: str) -> bool:
 
 
 def _file(path: Path, columns: DatasetColumns) -> TensorDictBase:
-    kinds = {".pt": _saved, ".safetensors": _safetensors}
-    if path.suffix not in kinds:
-        known = ", ".join([*_TABLES, *kinds])
-        raise ValueError(f"{path} is no dataset: there are {known} files and folders")
-    return kinds[path.suffix](path, columns)
+    if path.suffix not in _FILES:
+        raise ValueError(f"{path} is no dataset: there are {', '.join(_FILES)} files and folders")
+    return _FILES[path.suffix](path, columns)
 
 
 def _csv(path: Path, columns: DatasetColumns) -> TensorDict:
@@ -118,9 +111,6 @@ def _npz(path: Path, columns: DatasetColumns) -> TensorDict:
     )
 
 
-_TABLES: dict[str, Callable[[Path, DatasetColumns], TensorDict]] = {".csv": _csv, ".npz": _npz}
-
-
 def _saved(path: Path, columns: DatasetColumns) -> TensorDictBase:
     try:
         data = torch.load(path, weights_only=True, map_location="cpu")
@@ -130,7 +120,7 @@ def _saved(path: Path, columns: DatasetColumns) -> TensorDictBase:
             f"{path} cannot be read as plain tensors; write it by "
             "torch.save(data.clone().to_dict(), file), or data.memmap(folder)"
         ) from error
-    return _tensordict(path, data, columns)
+    return _named(str(path), _tensordict(path, data, columns), columns)
 
 
 def _safetensors(path: Path, columns: DatasetColumns) -> TensorDictBase:
@@ -150,7 +140,15 @@ def _safetensors(path: Path, columns: DatasetColumns) -> TensorDictBase:
             if not isinstance(inner, dict):
                 raise ValueError(f"{path} has {place!r} and {name!r} in it: leave one of them out")
         inner[last] = value
-    return _tensordict(path, data, columns)
+    return _named(str(path), _tensordict(path, data, columns), columns)
+
+
+_FILES: dict[str, Callable[[Path, DatasetColumns], TensorDictBase]] = {
+    ".csv": _csv,
+    ".npz": _npz,
+    ".pt": _saved,
+    ".safetensors": _safetensors,
+}
 
 
 def _tensordict(path: Path, data: Any, columns: DatasetColumns) -> TensorDictBase:

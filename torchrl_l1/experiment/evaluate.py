@@ -23,6 +23,7 @@ from torchrl_l1.algorithms.collection import (
 )
 from torchrl_l1.algorithms.policy import kinds_of
 from torchrl_l1.control import L1Config
+from torchrl_l1.control.config import follows_input
 from torchrl_l1.dynamics import calibrate_filter
 from torchrl_l1.dynamics.validation import one_step_residuals
 from torchrl_l1.envs import (
@@ -257,7 +258,7 @@ def check_plants(task: AnyTask, cells: Sequence[Condition]) -> None:
         return
     for cell in cells:
         changed = disturbed(cell.disturbances)
-        task.check_disturbances([n for n in changed if DISTURBANCES[n].acts_on == "plant"])
+        task.check_disturbances([n for n in changed if DISTURBANCES[n].of_plant])
 
 
 def check_controllers(own: L1Settings, task: AnyTask, cells: Sequence[Condition]) -> None:
@@ -287,7 +288,7 @@ def reachable(trained: TrainedRun, cells: Sequence[Condition]) -> list[Condition
         source = task.source
     else:
         return list(cells)
-    can_act = acting_on(source, trained.recipe.horizon or task.horizon)
+    can_act = acting_on(source, trained.algorithm.horizon)
     return [cell for cell in cells if can_act(disturbed(cell.disturbances))]
 
 
@@ -344,7 +345,7 @@ def _follows(trained: TrainedRun, cell: Condition) -> bool:
     if cell.l1 in UNTUNED:
         return False
     settings = _tested_l1(trained.recipe.l1, trained.algorithm.task, cell)
-    return settings.filter == "kalman"
+    return follows_input(settings.filter)
 
 
 def _tested_l1(own: L1Settings, task: AnyTask, cell: Condition) -> L1Settings:
@@ -358,8 +359,7 @@ def _tested_l1(own: L1Settings, task: AnyTask, cell: Condition) -> L1Settings:
         settings = own
     else:
         settings = replace(l1_option(cell.l1), epsilon=own.epsilon)
-    if cell.epsilon is not None:
-        settings = replace(settings, epsilon=cell.epsilon)
-    if cell.alpha is not None:
-        settings = replace(settings, alpha=cell.alpha, cutoff=None)
-    return settings
+    tuned: dict[str, Any] = {k: v for k, v in cell.tuning.items() if v is not None}
+    if "alpha" in tuned:
+        tuned["cutoff"] = None  # two ways to give one number
+    return replace(settings, **tuned)

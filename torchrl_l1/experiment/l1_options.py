@@ -9,7 +9,7 @@ from functools import cache
 from typing import Any
 
 from torchrl_l1.algorithms.collection import ORACLE
-from torchrl_l1.control.config import DEFAULT_ALPHA
+from torchrl_l1.control.config import DEFAULT_ALPHA, follows_input
 from torchrl_l1.envs import AnyTask
 from torchrl_l1.envs.tasks import is_plain
 from torchrl_l1.experiment.recipes import group_options, group_setting
@@ -22,7 +22,7 @@ UNTUNED = (OFF, ORACLE)
 """What a test may name in place of a controller that epsilon and alpha could tune."""
 
 # What runs are tuned by; it makes no other controller.
-_TUNED = ("enabled", "epsilon", "compile")
+_NO_OPTION = ("enabled", "epsilon", "compile")
 # Two ways to give one number.
 _FILTER = ("alpha", "cutoff")
 
@@ -48,13 +48,13 @@ def l1_option(name: str) -> L1Settings:
 
 
 def is_tuned(name: str) -> bool:
-    """Whether epsilon and alpha say something to what a test names: to low-pass filters.
+    """Whether epsilon and alpha say something to what a test names.
 
     Examples:
         >>> is_tuned("paper"), is_tuned("robust"), is_tuned("oracle")
         (True, False, False)
     """
-    return name not in UNTUNED and l1_options()[name].filter != "kalman"
+    return name not in UNTUNED and not follows_input(l1_options()[name].filter)
 
 
 def check_tested(names: Iterable[str]) -> None:
@@ -109,7 +109,7 @@ def departures(settings: L1Settings, option: str, task: str | AnyTask) -> dict[s
     shipped = l1_options()[option]
     found = {
         name: getattr(settings, name)
-        for name in (f.name for f in fields(L1Settings) if f.name not in (*_TUNED, *_FILTER))
+        for name in (f.name for f in fields(L1Settings) if f.name not in (*_NO_OPTION, *_FILTER))
         if getattr(settings, name) != getattr(shipped, name)
     }
     gain = filter_gain(settings, task)
@@ -164,14 +164,13 @@ def same_controller(one: L1Settings, other: L1Settings, task: str | AnyTask) -> 
     return first == second
 
 
-def controller_label(option: str, epsilon: float | None = None, alpha: float | None = None) -> str:
+def controller_label(option: str, **values: float | None) -> str:
     """An option and what a test has set of it, as tables and figures name a controller.
 
     Examples:
-        >>> controller_label("paper", 0.3, 0.1), controller_label("off")
+        >>> controller_label("paper", epsilon=0.3, alpha=0.1), controller_label("off", alpha=None)
         ('paper epsilon=0.3 alpha=0.1', 'off')
     """
-    values = {"epsilon": epsilon, "alpha": alpha}
     return " ".join([option, *(f"{k}={v:.9g}" for k, v in values.items() if v is not None)])
 
 

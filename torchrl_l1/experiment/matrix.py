@@ -38,6 +38,7 @@ class Axis:
         values: those that are tested where none are given; empty where the run has its own.
         help: what the values are, in words.
         choices: the only values that there are; empty if any may be tried.
+        tunes: whether they are values of the controller, whose name then tells them.
     """
 
     name: str
@@ -45,16 +46,19 @@ class Axis:
     values: tuple[Any, ...]
     help: str
     choices: tuple[str, ...] = ()
+    tunes: bool = False
 
 
-def _varied(
+def _axis(
     kind: type[str] | type[float],
     help: str,
     values: Iterable[Any] = (),
     choices: tuple[str, ...] = (),
+    *,
+    tunes: bool = False,
     **default: Any,
 ) -> Any:
-    axis = {"kind": kind, "help": help, "values": tuple(values), "choices": choices}
+    axis = {"kind": kind, "help": help, "values": tuple(values), "choices": choices, "tunes": tunes}
     return field(metadata={_AXIS: axis}, **default)
 
 
@@ -83,27 +87,30 @@ class Condition:
         ['paper', 'none', 0.5, 1.0, 0.3, None]
     """
 
-    l1: str = _varied(
+    l1: str = _axis(
         str,
         f"settings of the l1 group, or {ORACLE}, which is told the matched disturbances",
         (OFF, "paper"),
     )
-    noise: str = _varied(str, "settings of the noise group", ("none",), default="none")
+    noise: str = _axis(str, "settings of the noise group", ("none",), default="none")
     disturbances: Mapping[str, float] = field(default_factory=dict, hash=False)
-    policy: str = _varied(
+    policy: str = _axis(
         str,
         "sampled or mean actions; both by default, and sampled ones where they are the same",
         KINDS,
         choices=KINDS,
         default=KINDS[0],
     )
-    epsilon: float | None = _varied(
-        float, "tolerances of the switching law; the run's own by default", default=None
+    epsilon: float | None = _axis(
+        float, "tolerances of the switching law; the run's own by default", tunes=True, default=None
     )
-    alpha: float | None = _varied(
-        float, "gains of the filter per step; the controller's own by default", default=None
+    alpha: float | None = _axis(
+        float,
+        "gains of the filter per step; the controller's own by default",
+        tunes=True,
+        default=None,
     )
-    stage: str | None = _varied(
+    stage: str | None = _axis(
         str,
         "stages whose policies are tested, of algorithms with several "
         f"({', '.join(_STAGES)}); "
@@ -121,7 +128,12 @@ class Condition:
     @property
     def controller(self) -> str:
         """The controller in tables and figures, see :func:`controller_label`."""
-        return controller_label(self.l1, self.epsilon, self.alpha)
+        return controller_label(self.l1, **self.tuning)
+
+    @property
+    def tuning(self) -> dict[str, float | None]:
+        """What it sets of the controller, by the names of :data:`TUNING`; else ``None``."""
+        return {name: getattr(self, name) for name in TUNING}
 
     def columns(self) -> dict[str, Any]:
         """Its values by the names of :func:`axes`, as tables hold them."""
@@ -146,6 +158,10 @@ def axes() -> list[Axis]:
         else:
             found.append(Axis(part.name, **part.metadata[_AXIS]))
     return found
+
+
+TUNING = tuple(axis.name for axis in axes() if axis.tunes)
+"""Names of the axes whose values are the controller's, as columns of tables too."""
 
 
 def conditions(of_suite: str | None = None, **values: Sequence[Any]) -> list[Condition]:
@@ -181,15 +197,18 @@ def conditions(of_suite: str | None = None, **values: Sequence[Any]) -> list[Con
             f"alpha is given, and none of {', '.join(given['l1'])} has a low-pass filter: leave it "
             "out, or test paper"
         )
-    tunings = list(product(given["epsilon"] or (None,), given["alpha"] or (None,)))
+    tunings = [
+        dict(zip(TUNING, values, strict=True))
+        for values in product(*(given[name] or (None,) for name in TUNING))
+    ]
     cells = product(
         given["stage"] or (None,), given["policy"], given["noise"], disturbances, given["l1"]
     )
     return list(
         dict.fromkeys(
-            Condition(l1, noise, disturbance, policy, epsilon, alpha, stage)
+            Condition(l1, noise, disturbance, policy, stage=stage, **tuning)
             for stage, policy, noise, disturbance, l1 in cells
-            for epsilon, alpha in (tunings if is_tuned(l1) else [(None, None)])
+            for tuning in (tunings if is_tuned(l1) else [{}])
         )
     )
 

@@ -108,7 +108,7 @@ def record(
         raise ValueError(f"steps must be positive, got {steps}")
     task = trained.algorithm.task
     policy = trained.algorithm.policies[trained.stage(None)]
-    horizon = trained.recipe.horizon or task.horizon
+    horizon = trained.algorithm.horizon
 
     def collection(noise: float, rows: int) -> Collection:
         return Collection(

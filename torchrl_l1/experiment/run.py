@@ -26,7 +26,7 @@ from torchrl_l1.experiment.files import refuse_link
 from torchrl_l1.experiment.provenance import versions
 from torchrl_l1.experiment.run_directory import RunDirectory, read_config
 from torchrl_l1.experiment.settings import RunSettings, check_known, schema_of
-from torchrl_l1.experiment.signals import RESUME_ME, asked_to_make_room
+from torchrl_l1.experiment.shutdown import RESUME_ME, asked_to_make_room
 from torchrl_l1.experiment.tracking import check_loggers, lacks, trackers
 
 

@@ -18,6 +18,7 @@ from torchrl_l1.experiment.l1_options import controller_label
 from torchrl_l1.experiment.matrix import disturbed
 from torchrl_l1.report.identity import BASELINE
 from torchrl_l1.report.page import Row
+from torchrl_l1.report.recovery import panel_title, tested_place
 from torchrl_l1.report.study import noise_order
 from torchrl_l1.report.style import (
     Look,
@@ -147,14 +148,14 @@ def plot_disturbances(
         the file, or ``None`` if there is nothing to draw.
     """
     found: list[tuple[str, str, list[Row]]] = []
-    for stage, policy, noise in dict.fromkeys(map(_tested, rows)):
-        mine = [row for row in rows if _tested(row) == (stage, policy, noise)]
+    for stage, policy, noise in dict.fromkeys(map(tested_place, rows)):
+        mine = [row for row in rows if tested_place(row) == (stage, policy, noise)]
         varied = _varied(mine)
         if len(varied) > _MOST_ACROSS:
             varied = {k: v for k, v in varied.items() if len({row[k] for row in v}) > 2}
         if not varied and always:
             varied = {next(iter(DISTURBANCES)): mine}
-        name = _panel_title(algorithm.acting(policy, stage), noise)
+        name = panel_title(algorithm.acting(policy, stage), noise)
         found += [(name, what, chosen) for what, chosen in varied.items()]
     if not found:
         return None
@@ -189,10 +190,6 @@ def plot_disturbances(
     return save(figure, file)
 
 
-def _tested(row: Row) -> tuple[str, str, str]:
-    return row.get("stage", ""), row["policy"], row["noise"]
-
-
 def _varied(rows: Sequence[Row]) -> dict[str, list[Row]]:
     """By name of a disturbance that varies, the rows in which all others are neutral."""
     found = {}
@@ -202,11 +199,6 @@ def _varied(rows: Sequence[Row]) -> dict[str, list[Row]]:
         if len({row.get(what, entry.neutral) for row in chosen}) > 1:
             found[what] = chosen
     return found
-
-
-def _panel_title(actions: str, noise: str) -> str:
-    noises = "" if noise == "none" else f"noise: {noise}"
-    return ", ".join(filter(None, (actions, noises)))
 
 
 def _draw_disturbance(

@@ -9,14 +9,16 @@ from typing import Any
 from torchrl_l1.algorithms.collection import ORACLE
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.l1_options import UNTUNED, controller_label
-from torchrl_l1.experiment.matrix import disturbance_words
+from torchrl_l1.experiment.matrix import TUNING, disturbance_words
 from torchrl_l1.report.identity import BASELINE
 from torchrl_l1.report.page import Row, grouped, markdown
+from torchrl_l1.report.reading import SWITCH_RATE
 from torchrl_l1.report.recovery import (
     FEW_DISTURBANCES,
     controllers,
     recovered_text,
     recovery_columns,
+    tested_place,
     varied,
 )
 from torchrl_l1.report.style import arm_label
@@ -55,8 +57,8 @@ def summarize(rows: Sequence[Row], episodes: Sequence[Row] = ()) -> list[dict[st
             "return_lowest": min(returns),
             "return_highest": max(returns),
         }
-        if "l1/switch_rate" in members[0]:
-            rates = [float(row["l1/switch_rate"]) for row in members]
+        if SWITCH_RATE in members[0]:
+            rates = [float(row[SWITCH_RATE]) for row in members]
             entry["switches_per_1000_steps"] = 1000 * median(rates)
         if found[-1] not in UNTUNED:
             which = (BASELINE, found[-1], ORACLE)
@@ -67,7 +69,7 @@ def summarize(rows: Sequence[Row], episodes: Sequence[Row] = ()) -> list[dict[st
 
 def _key(row: Row, keys: Sequence[str]) -> Key:
     neutral = {name: entry.neutral for name, entry in DISTURBANCES.items()}
-    name = controller_label(row["l1"], row.get("epsilon"), row.get("alpha"))
+    name = controller_label(row["l1"], **{axis: row.get(axis) for axis in TUNING})
     cell = {"stage": None, **neutral, **row, "l1": name}
     return tuple(cell[key] for key in keys)
 
@@ -76,11 +78,7 @@ def summary_tables(summary: Sequence[Row]) -> str:
     """A summary as Markdown that reads well in a terminal: a table per stage, policy and noise."""
     blocks = []
     for (stage, policy, noise), _ in grouped(summary, ("stage", "policy", "noise"), "l1"):
-        mine = [
-            row
-            for row in summary
-            if (row.get("stage", ""), row["policy"], row["noise"]) == (stage, policy, noise)
-        ]
+        mine = [row for row in summary if tested_place(row) == (stage, policy, noise)]
         seeds = mine[0]["training_seeds"]
         words = ", ".join(filter(None, (stage, f"{policy} policy", f"noise {noise}")))
         table = _aligned(markdown(summary_lines(mine)))

@@ -10,7 +10,7 @@ import numpy as np
 from torchrl_l1.algorithms.collection import ORACLE
 from torchrl_l1.algorithms.facts import AlgorithmFacts
 from torchrl_l1.envs import DISTURBANCES
-from torchrl_l1.experiment.matrix import undisturbed
+from torchrl_l1.experiment.matrix import TUNING, undisturbed
 from torchrl_l1.report.evaluation_figures import (
     L1_IN,
     plot_ablation,
@@ -325,8 +325,7 @@ def _tested(run: Run, test: Evaluation) -> str:
 
 
 def _set_values(test: Evaluation) -> dict[str, Any]:
-    values = {"option": test.l1, "epsilon": test.epsilon, "alpha": test.alpha}
-    return values if test.tuned else {}
+    return {"option": test.l1, **test.tuning} if test.tuned else {}
 
 
 def _summary(tests: Sequence[tuple[Run, Evaluation]]) -> dict[str, Any]:
@@ -386,7 +385,8 @@ def _published(run: Run, key: Key) -> dict[str, str]:
 def _order(key: Key, test: Evaluation) -> Key:
     l1, noise, *disturbances, policy, _ = key
     # By the values, where their texts would put 10 before 3.
-    controller = (test.l1, test.epsilon or 0.0, test.alpha or 0.0) if test.tuned else (l1, 0.0, 0.0)
+    option = test.l1 if test.tuned else l1
+    controller = (option, *(value or 0.0 for value in test.tuning.values()))
     place = (policy != "stochastic", noise_order(noise), *disturbances)
     return *place, (l1 != BASELINE) + (l1 == ORACLE), controller
 
@@ -425,8 +425,7 @@ def tuning_table(rows: Sequence[Row]) -> str:
         {
             **_place(row, names),
             "L1": row.get("option", row["l1"]),
-            "epsilon": number(row.get("epsilon")),
-            "alpha": number(row.get("alpha")),
+            **{name: number(row.get(name)) for name in TUNING},
             "training seeds": str(row["training_seeds"]),
             "return": return_text(row),
             "less off": difference_text(row),

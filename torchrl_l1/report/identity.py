@@ -39,8 +39,13 @@ ALGORITHMS: Mapping[str, AlgorithmFacts] = {
 BASELINE = OFF
 """Name of the arm without L1."""
 
-NOISES = ("none", "action", "observation", "both")
-"""Noise settings in the order in which tables and figures show them."""
+NOISES: Mapping[str, str] = {
+    "none": "no noise",
+    "action": "action noise",
+    "observation": "observation noise",
+    "both": "action and observation noise",
+}
+"""Noise settings in the order in which tables and figures show them, in words."""
 
 # Keys that tell runs apart in other ways, or that do not touch the result.
 _VOLATILE = [key for key in VOLATILE_KEYS if key != "search_path"]

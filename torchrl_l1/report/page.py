@@ -41,12 +41,12 @@ class Page:
         part.name, part._blocks, part._taken = name, self._blocks, self._taken
         return part
 
-    def file(self, *words: str, suffix: str = ".png") -> Path:
-        """Where a further file of this part goes; a long name is cut, and ends in its digest.
+    def file(self, *words: str) -> Path:
+        """Where a further figure of this part goes; a long name is cut, and ends in its digest.
 
         Words that differ in nothing but signs, as -0.5 and 0.5, have names with a number.
         """
-        return self._free(slug((self.name, *words)), suffix)
+        return self._free(slug((self.name, *words)), ".png")
 
     def _free(self, name: str, suffix: str) -> Path:
         """A name that no other file of the page has, also where capitals make no difference."""

@@ -20,12 +20,19 @@ from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.evaluate import episodes_file
 from torchrl_l1.experiment.files import read_text
-from torchrl_l1.experiment.matrix import Condition, axes
+from torchrl_l1.experiment.matrix import TUNING, Condition, axes
 
 SWITCH_RATE = "l1/switch_rate"
 """Column of the switches per step."""
 
-SIGNALS = (SWITCH_RATE, "l1/u_a", "l1/saturation")
+L1_COLUMNS = {
+    "switches_per_1000": (SWITCH_RATE, 1000),
+    "u_a": ("l1/u_a", 1),
+    "saturation": ("l1/saturation", 1),
+}
+"""Columns of a report's tables, with the signal that each shows and a factor."""
+
+SIGNALS = tuple(signal for signal, _ in L1_COLUMNS.values())
 """Columns of a metrics table that only runs with L1 have."""
 
 AGAIN = "Move the run directory away, or run it again"
@@ -77,9 +84,6 @@ def read_seconds(file: Path, iterations: int, phases: Sequence[str]) -> dict[str
 # Every table has the columns of these; that of another disturbance may be absent.
 _FIRST_DISTURBANCES = ("bias", "gain")
 
-# What a test may have set of a controller.
-_TUNED = ("epsilon", "alpha")
-
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation(Condition):
@@ -113,7 +117,7 @@ class Evaluation(Condition):
     @property
     def tuned(self) -> bool:
         """Whether the test has set values of the controller."""
-        return any(getattr(self, name) is not None for name in _TUNED)
+        return any(value is not None for value in self.tuning.values())
 
 
 MEASURED: Mapping[str, str] = {"steps_mean": "steps_mean", "switch_rate": SWITCH_RATE}
@@ -127,7 +131,7 @@ def condition_columns() -> tuple[str, ...]:
         >>> [name for name in condition_columns() if name not in DISTURBANCES]
         ['l1', 'noise', 'policy', 'stage']
     """
-    return tuple(axis.name for axis in axes() if axis.name not in _TUNED)
+    return tuple(axis.name for axis in axes() if axis.name not in TUNING)
 
 
 def read_evaluations(file: Path) -> list[Evaluation]:
@@ -155,7 +159,7 @@ def read_evaluations(file: Path) -> list[Evaluation]:
             )
     return [
         Evaluation(
-            **_varied(row),
+            **_condition_fields(row),
             return_mean=row["return_mean"],
             episodes=int(row["episodes"]),
             own_l1=None if math.isnan(row["own_l1"]) else bool(row["own_l1"]),
@@ -166,10 +170,10 @@ def read_evaluations(file: Path) -> list[Evaluation]:
     ]
 
 
-def _varied(row: Mapping[str, Any]) -> dict[str, Any]:
+def _condition_fields(row: Mapping[str, Any]) -> dict[str, Any]:
     """The fields of a condition."""
     words = {axis.name: row[axis.name] or None for axis in axes() if axis.kind is str}
-    tuned = {name: _known(row[name]) for name in _TUNED}
+    tuned = {name: _known(row[name]) for name in TUNING}
     return {
         **words,
         **tuned,
@@ -207,7 +211,7 @@ def _condition_rows(
         file,
         (*_FIRST_DISTURBANCES, *numbers),
         ("l1", "noise", "policy"),
-        (*_TUNED, *optional),
+        (*TUNING, *optional),
         ("stage",),
         later,
         results,
@@ -216,7 +220,7 @@ def _condition_rows(
 
 
 def _condition_key(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    tuning = {name: _known(row[name]) for name in _TUNED}
+    tuning = {name: _known(row[name]) for name in TUNING}
     return tuple({**row, **tuning}.get(axis.name) for axis in axes())
 
 

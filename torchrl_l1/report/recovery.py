@@ -290,7 +290,9 @@ def plot_heat_map(
     scale = shown.scale(np.array([float(row[shown.column]) for row in known]))
     tested = controllers(mine)
     lines = list(dict.fromkeys(map(disturbance_words, sorted(mine, key=by_disturbance))))
-    places = sorted(dict.fromkeys(map(_place, known)), key=lambda place: noise_order(place[2]))
+    places = sorted(
+        dict.fromkeys(map(tested_place, known)), key=lambda place: noise_order(place[2])
+    )
     labels = 0.075 * max(map(len, lines))
     figure, axes = grid(
         len(places),
@@ -302,14 +304,12 @@ def plot_heat_map(
         cells = {
             (lines.index(disturbance_words(row)), tested.index(row["l1"])): row
             for row in known
-            if _place(row) == (stage, policy, noise)
+            if tested_place(row) == (stage, policy, noise)
         }
         _draw(axis, cells, (len(lines), len(tested)), shown, scale)
         axis.set_xticks(range(len(tested)), [arm_label(l1).replace(" ", "\n") for l1 in tested])
         axis.set_yticks(range(len(lines)), lines)
-        axis.set_title(
-            ", ".join(filter(None, (algorithm.acting(policy, stage), _noise(noise)))), fontsize=10
-        )
+        axis.set_title(panel_title(algorithm.acting(policy, stage), noise), fontsize=10)
     figure.suptitle(f"{heading}\n{shown.words}", fontsize=10)
     return save(figure, file)
 
@@ -342,12 +342,19 @@ def _draw(
     axis.tick_params(which="minor", length=0)
 
 
-def _place(row: Row) -> tuple[str, str, str]:
+def tested_place(row: Row) -> tuple[str, str, str]:
+    """Stage, kind of policy and noise of a test, each with panels and tables of its own."""
     return row.get("stage", ""), row["policy"], row["noise"]
 
 
-def _noise(noise: str) -> str:
-    return "" if noise == "none" else f"noise: {noise}"
+def panel_title(actions: str, noise: str) -> str:
+    """How a policy acts and under which noise, where there is something to say of either.
+
+    Examples:
+        >>> panel_title("sampled actions", "action"), panel_title("sampled actions", "none")
+        ('sampled actions, noise: action', 'sampled actions')
+    """
+    return ", ".join(filter(None, (actions, f"noise: {noise}" * (noise != "none"))))
 
 
 def recovery_section(page: Page, algorithm: AlgorithmFacts, name: str, rows: Sequence[Row]) -> None:
@@ -370,9 +377,8 @@ def recovery_section(page: Page, algorithm: AlgorithmFacts, name: str, rows: Seq
         heading += f", stage {stage}" * bool(stage)
         for policy, noise in dict.fromkeys((row["policy"], row["noise"]) for row in chosen):
             mine = [row for row in chosen if (row["policy"], row["noise"]) == (policy, noise)]
-            acting = algorithm.actions(policy, stage)
-            words_of = ", ".join(filter(None, (heading, acting, _noise(noise))))
-            page.text(f"{words_of}:", robustness_table(mine))
+            acting = panel_title(algorithm.actions(policy, stage), noise)
+            page.text(f"{', '.join(filter(None, (heading, acting)))}:", robustness_table(mine))
         for shown, what in ((RETURNS, "returns"), (SHARES, "recovered")):
             file = page.file(what, name, *words)
             drawn = plot_heat_map(chosen, shown, named(page.name, heading), file, algorithm)

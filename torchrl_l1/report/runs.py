@@ -23,6 +23,7 @@ from torchrl_l1.experiment.run_directory import RunDirectory, run_directories
 from torchrl_l1.report.identity import Identity, facts, identify
 from torchrl_l1.report.reading import (
     AGAIN,
+    L1_COLUMNS,
     SIGNALS,
     Evaluation,
     distinct_policies,
@@ -33,13 +34,6 @@ from torchrl_l1.report.reading import (
 )
 
 T = TypeVar("T")
-
-# Columns of tables, with the signal that each shows and a factor.
-_L1_COLUMNS = {
-    "switches_per_1000": ("l1/switch_rate", 1000),
-    "u_a": ("l1/u_a", 1),
-    "saturation": ("l1/saturation", 1),
-}
 
 
 @dataclass
@@ -136,7 +130,7 @@ class Run:
 
 
 def l1_means(
-    runs: Sequence[Run], parts: Sequence[np.ndarray], columns: Sequence[str] = tuple(_L1_COLUMNS)
+    runs: Sequence[Run], parts: Sequence[np.ndarray], columns: Sequence[str] = tuple(L1_COLUMNS)
 ) -> dict[str, float]:
     """What L1 did in some outer iterations of each run: means over runs of what is known.
 
@@ -147,7 +141,7 @@ def l1_means(
     """
     means = {}
     for column in columns:
-        signal, factor = _L1_COLUMNS[column]
+        signal, factor = L1_COLUMNS[column]
         values = [run.signals[signal][part].mean() for run, part in zip(runs, parts, strict=True)]
         means[column] = float(np.mean([factor * float(value) for value in values]))
     return {column: mean for column, mean in means.items() if np.isfinite(mean)}

@@ -26,7 +26,7 @@ from torchrl_l1.report.statistics import difference_summary, mean_summary
 from torchrl_l1.report.study import Study, place_columns, with_baselines
 from torchrl_l1.report.style import arm_label, named, title
 
-_L1_COLUMNS = ("switches_per_1000", "u_a")
+_SHOWN = ("switches_per_1000", "u_a")
 
 
 def stage_sections(page: Page, study: Study) -> None:
@@ -78,7 +78,7 @@ def stage_rows(study: Study) -> list[dict[str, Any]]:
                         "std": float(np.std(returns)),
                         "return_values": " ".join(f"{value:.6g}" for value in returns),
                         "real_steps": round(float(np.mean([_steps(r, position) for r in done]))),
-                        **l1_means(done, ends, _L1_COLUMNS),
+                        **l1_means(done, ends, _SHOWN),
                         **_differences(study, runs, position, stage, policy),
                     }
                 )

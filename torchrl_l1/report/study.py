@@ -297,7 +297,7 @@ def noise_order(noise: str) -> tuple[object, ...]:
         ...        key=noise_order)
         ['both', 'action 1e-05', 'action 0.3', 'action 0.3, observation 1']
     """
-    index, name = _place(NOISES, noise)
+    index, name = _place(list(NOISES), noise)
     parts = [re.fullmatch(r"(\w+) (\S+)", part) for part in noise.split(", ")]
     kinds = tuple(part[1] for part in parts if part)
     levels = tuple(_number_first(part[2]) for part in parts if part)

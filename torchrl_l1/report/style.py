@@ -23,7 +23,7 @@ from matplotlib.ticker import FuncFormatter, LogFormatter, NullFormatter
 
 from torchrl_l1.algorithms.collection import ORACLE
 from torchrl_l1.atomic import write_through
-from torchrl_l1.report.identity import BASELINE
+from torchrl_l1.report.identity import BASELINE, NOISES
 
 _DPI = 130
 
@@ -35,13 +35,6 @@ _CYCLE = ("#D55E00", "#0072B2", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#00
 
 _STYLES: Sequence[Any] = ("-", "-.", (0, (6, 1, 1, 1, 1, 1)), (0, (1, 1)))
 _MARKERS = "osD^"
-
-_NOISES = {
-    "none": "no noise",
-    "action": "action noise",
-    "observation": "observation noise",
-    "both": "action and observation noise",
-}
 
 
 def color(index: int, arm: str | None = None) -> str:
@@ -147,8 +140,8 @@ def noise_words(noise: str) -> str:
         >>> noise_words("none"), noise_words("action 0.3, observation 0.05")
         ('no noise', 'action noise 0.3 and observation noise 0.05')
     """
-    if noise in _NOISES:
-        return _NOISES[noise]
+    if noise in NOISES:
+        return NOISES[noise]
     levels = [re.fullmatch(r"(\w+) (\S+)", part) for part in noise.split(", ")]
     if not all(levels):
         return f"noise {noise}"

@@ -1,4 +1,4 @@
-"""Signals: a line, an orderly end, and a status that says what to do next."""
+"""What ends a process: a line, an orderly end, and a status that says what to do next."""
 
 from __future__ import annotations
 
