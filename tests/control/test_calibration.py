@@ -142,3 +142,41 @@ def test_the_smallest_inflation_is_found_in_any_order():
         for tried in ((1.0, 4.0, 16.0), (16.0, 1.0, 4.0))
     ]
     assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("action", [0.0, 0.8, 1.0])
+def test_of_a_disturbance_put_in_at_a_bound_only_what_comes_through_is_found(action):
+    config = L1Config.robust(0.02, initial_deviation=0.5, forgetting=1.0, dead_zone=0.0, **BOUNDS)
+    errors = []
+    for executed in (action, -action):
+        # One stretch, disturbed from its reset on: outwards under one of the two, inwards at the
+        # other. The model misses nothing.
+        found = calibrate(
+            config,
+            torch.zeros(1, 40, 1),
+            torch.full((1, 40, 1, 1), 0.5),
+            1e-8 * torch.eye(1),
+            action=torch.full((1, 40, 1), executed),
+            inflations=[1.0],
+            process_noises=[0.001],
+        )
+        errors.append(found.table[0]["error"])
+    cut_off = max(0.0, 0.5 - (1.0 - action))
+    # Half of the replays have no disturbance, and none that is not there is found.
+    assert sorted(errors) == pytest.approx([0.0, cut_off * math.sqrt(0.5)], abs=2e-3)
+
+
+def test_a_replay_knows_what_was_executed():
+    config = L1Config.robust(
+        0.02, initial_deviation=0.5, process_noise=0.1, inflation=1.0, forgetting=1.0, **BOUNDS
+    )
+    # At either bound the same push, as of a load: outwards it may be one, and says nothing. What
+    # has been found is cut off at a bound, and no less there for it.
+    action = torch.tensor([[1.0] * 5, [-1.0] * 5, [0.0, 0.0, 1.0, 1.0, 1.0]]).unsqueeze(-1)
+    push = 0.5 * torch.tensor([[0.3] * 5, [0.3] * 5, [0.3, 0.3, 0.0, 0.0, 0.0]]).unsqueeze(-1)
+    statistics = ResidualStatistics(1e-8 * torch.eye(1))
+    mean, variance = replay(config, push, torch.full((3, 5, 1, 1), 0.5), action, statistics)
+    assert not mean[0, 0].any()
+    walked = 0.5**2 + 0.1**2 * torch.arange(1.0, 6.0)
+    torch.testing.assert_close(variance[0, 0, :, 0], walked)
+    torch.testing.assert_close(mean[0, 1:], torch.full((2, 5, 1), 0.3), atol=1e-4, rtol=0)

@@ -168,6 +168,44 @@ def test_weight_decay_pulls_each_layer_by_its_coefficient(form: str) -> None:
         torch.testing.assert_close(decayed, without - pull)
 
 
+def test_the_weight_penalty_is_that_of_the_whole_data_in_hidden_layers() -> None:
+    weights = []
+    for penalty in (0.0, 6.0):
+        torch.manual_seed(0)
+        model = EnsembleDynamics(2, 1, members=2, hidden=(5, 4))
+        before = [weight.detach().clone() for weight in model.network.weights]
+        config = FitConfig(0.1, batch_size=10, max_gradient_steps=1, weight_penalty=penalty)
+        fit_once(model, transitions(50), config, sgd=True)  # 40 of them to train on
+        weights.append(list(model.network.weights))
+    pulls = [0.1 * 6.0 / 40 * weight for weight in before[:-1]] + [torch.zeros(())]
+    for without, penalised, pull in zip(*weights, pulls, strict=True):
+        torch.testing.assert_close(penalised, without - pull)
+
+
+class RecordingSGD(torch.optim.SGD):
+    """Keeps the learning rate of each step."""
+
+    def __init__(self, model: EnsembleDynamics) -> None:
+        super().__init__(model.parameters(), lr=1.0)
+        self.rates: list[float] = []
+
+    def step(self, closure: None = None) -> None:  # type: ignore[override]
+        self.rates += [group["lr"] for group in self.param_groups]
+        super().step(closure)
+
+
+@pytest.mark.parametrize(("most", "steps"), [(100, 6), (4, 4)])
+def test_the_learning_rate_falls_in_a_line_over_the_steps_of_a_fit(most: int, steps: int) -> None:
+    model = EnsembleDynamics(2, 1, members=2, hidden=(4,))
+    optimizer = RecordingSGD(model)
+    config = FitConfig(1e-3, 0.4, batch_size=20, max_epochs=3, patience=9, max_gradient_steps=most)
+    data = transitions(50)  # 40 of them to train on, two batches
+    for _ in range(2):
+        fit_ensemble(model, data, config, optimizer)
+    expected = [1e-3 * (1 - 0.6 * step / steps) for step in range(steps)]
+    assert optimizer.rates == pytest.approx(2 * expected)
+
+
 def test_the_best_members_are_kept_as_elites() -> None:
     torch.manual_seed(0)
     data = transitions(200)

@@ -48,6 +48,21 @@ def test_the_covariance_is_positive_definite_whatever_the_residuals(seed, count,
     torch.testing.assert_close(covariance, covariance.T)
 
 
+def test_correlations_of_few_residuals_are_shrunk_as_schaefer_and_strimmer_do():
+    rows = np.random.default_rng(0).normal(size=(8, 4)) @ np.array(
+        [[1.0, 0.8, 0.0, 0.0], [0.0, 0.6, 0.0, 0.5], [0.0, 0.0, 3.0, 0.0], [0.0, 0.0, 0.0, 0.1]]
+    )
+    deviation = np.sqrt((rows**2).mean(0))
+    products = np.einsum("ki,kj->kij", rows / deviation, rows / deviation)
+    correlation = products.mean(0)
+    uncertainty = products.var(0, ddof=1) / 8  # of each correlation
+    off = ~np.eye(4, dtype=bool)
+    intensity = uncertainty[off].sum() / (correlation[off] ** 2).sum()
+    assert 0.1 < intensity < 0.9
+    expected = np.where(off, (1 - intensity) * correlation, 1.0) * np.outer(deviation, deviation)
+    np.testing.assert_allclose(shrunk_covariance(torch.as_tensor(rows)), expected)
+
+
 def test_a_constant_error_counts():
     assert shrunk_covariance(torch.full((10, 1), 2.0)).item() == pytest.approx(4.0)
 

@@ -129,6 +129,14 @@ def test_compensation_is_the_inverse_and_changes_nothing(make, value, seed):
             restart(env, [True, False, True])
 
 
+def test_what_does_not_reach_a_dead_motor_is_left_as_it_is():
+    wanted = torch.tensor([[0.5, 0.25], [0.0, 0.0]], dtype=torch.float64)
+    for transform, sent in [(ActuatorGain([0.5, 0]), [1, 0.25]), (FailingMotor(0), [0.5, 0.25])]:
+        env = TransformedEnv(Echo((2,)), transform)
+        env.reset()
+        assert transform.compensate(wanted).tolist() == [sent, [0, 0]]
+
+
 def test_bias_of_random_signs_is_drawn_anew_where_an_episode_starts():
     torch.manual_seed(0)
     env = TransformedEnv(Echo((3,), 20), ActuatorBias(RandomSigns(0.3)))
