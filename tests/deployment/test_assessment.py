@@ -6,8 +6,14 @@ import torch
 from PIL import Image
 from tensordict import TensorDict
 
+from torchrl_l1.control import L1Config
 from torchrl_l1.deployment import Assessment
-from torchrl_l1.deployment.assessment import single_disturbances, summarize_episodes
+from torchrl_l1.deployment.assessment import (
+    Episodes,
+    _columns,
+    single_disturbances,
+    summarize_episodes,
+)
 from torchrl_l1.envs import suite
 
 
@@ -45,6 +51,18 @@ def test_episodes_count_up_to_their_end():
     assert found.returns.tolist() == [0 + 1 + 2, 5 + 6 + 7 + 8 + 9]
     assert found.steps.tolist() == [3, 5]
     assert found.switches == pytest.approx(1000 * 2 / 8)
+
+
+def test_columns_are_the_median_and_the_range():
+    episodes = Episodes(np.array([1.0, 9.0, 2.0]), np.array([5, 3, 3]), switches=50.0)
+    expected = {
+        "episodes": 3, "return_mean": 4.0,
+        "return_median": 2.0, "return_lowest": 1.0, "return_highest": 9.0,
+        "steps_median": 3.0, "steps_lowest": 3.0, "steps_highest": 5.0,
+    }  # fmt: skip
+    assert _columns(episodes, L1Config.robust(0.04)) == _columns(episodes, None) == expected
+    paper = L1Config.paper(0.04, epsilon=0.3)
+    assert _columns(episodes, paper) == expected | {"switches_per_1000_steps": 50.0}
 
 
 def test_rows_are_there_for_each_disturbance_and_controller(table):
