@@ -62,6 +62,11 @@ def test_resumed_run_repeats_the_unbroken_one(l1: L1Config | None) -> None:
     assert before + after == unbroken
 
 
+@pytest.mark.parametrize("shared", [True, False])
+def test_candidates_meet_the_same_draws_if_asked_to(shared: bool) -> None:
+    assert make(None, common_noise=shared).policy.sampler.common_noise == shared
+
+
 def test_models_are_fitted_every_so_many_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
     algorithm, seen = make(None, outer_iterations=3, fit_every=2), []
     fit = algorithm.learning.fit
