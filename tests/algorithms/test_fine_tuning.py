@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from copy import deepcopy
 
 import pytest
@@ -179,3 +180,39 @@ def test_resumed_rounds_repeat_the_unbroken_ones() -> None:
         agent.step(data.clone())
     for name, value in policy.state_dict().items():
         assert torch.equal(value, copy.state_dict()[name]), name
+
+
+@pytest.mark.parametrize(("coefficient", "steps"), [(0.0, 0), (1.0, 6)])
+def test_entropy_is_rewarded_as_asked(
+    coefficient: float, steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where no action is better, only the spread grows: by the step size, as a slope of one has."""
+    policy, fine_tuning = make(
+        entropy_coefficient=coefficient, learning_rate=0.01, epochs=3, value_epochs=1, minibatches=2
+    )
+    weights = [part.clone() for part in policy.mean.parameters()]
+    nothing = torch.zeros(200, 1, 1)
+    monkeypatch.setattr(
+        fine_tuning,
+        "advantage",
+        lambda data: data.update({"advantage": nothing, "value_target": nothing}),
+    )
+    fine_tuning.step(episodes(policy, 1.0))
+    assert policy.log_std.item() == pytest.approx(math.log(0.5) + 0.01 * steps, abs=1e-5)
+    pairs = zip(weights, policy.mean.parameters(), strict=True)
+    assert all(torch.equal(before, part) for before, part in pairs)
+
+
+def test_gradients_of_each_network_are_no_longer_than_allowed() -> None:
+    policy, fine_tuning = make(max_gradient_norm=1e-3, epochs=2, value_epochs=2, minibatches=2)
+    lengths = []
+    for optimizer in fine_tuning.optimizers.values():
+        optimizer.register_step_pre_hook(
+            lambda optimizer, *_: lengths.append(
+                math.hypot(*(p.grad.norm().item() for p in optimizer.param_groups[0]["params"]))
+            )
+        )
+    data = episodes(policy, 1.0)
+    data["next", "reward"] *= 1e6
+    fine_tuning.step(data)
+    assert len(lengths) == 8 and lengths == pytest.approx([1e-3] * 8, rel=1e-2)

@@ -190,6 +190,11 @@ def test_only_fresh_plans_are_cloned_and_what_was_planned_not_what_acted() -> No
     assert not torch.equal(cloned["action"][-4:], last["executed"][::3])
 
 
+def test_later_rewards_count_for_less_in_plans() -> None:
+    algorithm = make(None, plan_discount=0.9)
+    assert [one.sampler.discount for one in (algorithm.planner, algorithm.labeller)] == [0.9] * 2
+
+
 def test_noise_is_in_all_stages_and_l1_around_the_planner_alone() -> None:
     perturbation = Perturbation(action_noise=0.1, observation_noise=0.2)
     algorithm = MBMF("inverted_pendulum", tiny(), L1, perturbation, horizon=10)

@@ -5,11 +5,13 @@ from copy import deepcopy
 
 import pytest
 import torch
+from torchrl.data import ReplayBuffer
 
 from torchrl_l1.algorithms import METRPO, METRPOConfig, Perturbation
 from torchrl_l1.algorithms.config import ModelConfig
 from torchrl_l1.algorithms.metrpo_config import PolicyConfig
 from torchrl_l1.algorithms.outcomes import OUTCOME_METRICS
+from torchrl_l1.algorithms.policy_improvement import PolicyStep
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.objectives import TRPOConfig
@@ -149,6 +151,30 @@ def test_imagined_trajectories_start_where_the_configuration_says() -> None:
     assert from_data.tolist() == [False] * 30 + [True] * 10
     # The others are the pendulum's resets: within 0.01 of upright rest.
     assert starts[:30].abs().max() <= 0.01
+
+
+@pytest.mark.parametrize(("reset_std", "normalize"), [(True, False), (False, True)])
+def test_each_round_begins_with_the_policy_that_settings_ask_for(
+    reset_std: bool, normalize: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = PolicyConfig(hidden=[8], std=2.0, reset_std=reset_std, normalize=normalize)
+    algorithm = make(l1=None, policy=settings, trpo_iterations=1)
+    policy, improvement, seen = algorithm.policy, algorithm.improvement, []
+    step = improvement.step
+
+    def watched(buffer: ReplayBuffer) -> PolicyStep:
+        data = buffer[:]["observation"].double()
+        seen.append((policy.log_std.exp().item(), policy.normalizer.mean.clone(), data.mean(0)))
+        return step(buffer)
+
+    monkeypatch.setattr(improvement, "step", watched)
+    results = [result.metrics for result in algorithm.iterate()]
+    assert [std for std, *_ in seen] == pytest.approx(
+        [2.0, 2.0 if reset_std else results[0]["policy/std"]]
+    )
+    assert results[0]["policy/std"] != pytest.approx(2.0, rel=1e-4)
+    for _, mean, expected in seen:
+        torch.testing.assert_close(mean.double(), expected * normalize, atol=1e-5, rtol=1e-4)
 
 
 def test_two_iterations_learn_to_balance() -> None:

@@ -16,6 +16,8 @@ from torchrl_l1.algorithms import (
     Perturbation,
     PolicyConfig,
 )
+from torchrl_l1.algorithms.collection import episode_returns
+from torchrl_l1.algorithms.policy_improvement import PolicyStep
 from torchrl_l1.control import L1Config
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.envs import make_env
@@ -107,6 +109,29 @@ def test_the_model_is_fitted_once_and_the_policy_goes_on() -> None:
     assert not all(map(torch.equal, policy, algorithm.policy.parameters()))
     for name, value in algorithm.acting_dynamics.state_dict().items():
         assert torch.equal(value, model[name]), name
+
+
+@pytest.mark.parametrize("reset_std", [True, False])
+def test_each_round_begins_with_the_spread_that_settings_ask_for(
+    reset_std: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = PolicyConfig(hidden=[8], std=2.0, reset_std=reset_std)
+    algorithm = make(policy=settings, trpo_iterations=1)
+    step, seen = algorithm.improvement.step, []
+
+    def watched(buffer: ReplayBuffer) -> PolicyStep:
+        seen.append(algorithm.policy.log_std.exp().item())
+        return step(buffer)
+
+    monkeypatch.setattr(algorithm.improvement, "step", watched)
+    first, second = (result.metrics for result in algorithm.iterate())
+    assert seen == pytest.approx([2.0, 2.0 if reset_std else first["policy/std"]])
+    assert first["policy/std"] != pytest.approx(2.0, rel=1e-4)
+    # The returns of the last round can be measured again.
+    for name, deterministic in (("return_mean", False), ("return_deterministic", True)):
+        data = algorithm.evaluation.evaluate(0, 1, deterministic=deterministic)
+        assert second[name] == episode_returns(data).mean().item()
+    assert second["return_mean"] != second["return_deterministic"]
 
 
 @pytest.mark.parametrize("penalty", ["mopo", "morel"])

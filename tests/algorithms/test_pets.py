@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
+import torch
 
 from torchrl_l1.algorithms import PETS, PETSConfig
 from torchrl_l1.algorithms.config import ModelConfig
 from torchrl_l1.control import L1Config
-from torchrl_l1.dynamics import FitConfig
+from torchrl_l1.dynamics import FitConfig, FitReport
 from torchrl_l1.planning import CEMConfig
 
 L1 = L1Config(0.04, epsilon=0.2, action_low=-3.0, action_high=3.0)
@@ -58,6 +60,35 @@ def test_resumed_run_repeats_the_unbroken_one(l1: L1Config | None) -> None:
     second.load_state_dict(first.state_dict())
     after = [result.metrics for result in second.iterate()]
     assert before + after == unbroken
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_candidates_meet_the_same_draws_if_asked_to(shared: bool) -> None:
+    assert make(None, common_noise=shared).policy.sampler.common_noise == shared
+
+
+def test_models_are_fitted_every_so_many_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    algorithm, seen = make(None, outer_iterations=3, fit_every=2), []
+    fit = algorithm.learning.fit
+
+    def watched(on_epoch: Callable[[int], None]) -> FitReport:
+        seen.append(len(algorithm.learning.buffer))
+        return fit(on_epoch)
+
+    monkeypatch.setattr(algorithm.learning, "fit", watched)
+    losses = [result.metrics["model/train_loss"] for result in algorithm.iterate()]
+    assert seen == [20, 60]
+    assert losses[0] == losses[1] != losses[2]
+
+
+def test_a_plan_acts_for_so_many_steps() -> None:
+    data = make(None, replan_every=3).collection.collect(0, 0)
+    promised, action = data["next", "plan", "best_return"][..., 0], data["action"]
+    for step in range(10):
+        fresh = step % 3 == 0
+        assert (promised[:, step] == promised[:, step - 1]).any() == (not fresh)
+        # What is left of the plan before is where the search for the next begins.
+        assert torch.equal(action[:, step], data["plan", "mean"][:, step, 0]) == (not fresh)
 
 
 def test_seeds_matter() -> None:

@@ -63,6 +63,22 @@ def test_switches_are_shown_of_the_laws_that_epsilon_tunes(law, monkeypatch):
     assert ("switches_per_1000_steps" in columns) == l1_options.is_tuned("option")
 
 
+def test_columns_are_the_median_and_the_range():
+    episodes = Episodes(np.array([1.0, 9.0, 2.0]), np.array([5, 3, 3]), switches=50.0)
+    expected = {
+        "episodes": 3, "return_mean": 4.0,
+        "return_median": 2.0, "return_lowest": 1.0, "return_highest": 9.0,
+        "steps_median": 3.0, "steps_lowest": 3.0, "steps_highest": 5.0,
+    }  # fmt: skip
+    assert (
+        assessment._columns(episodes, L1Config.robust(0.04))
+        == assessment._columns(episodes, None)
+        == expected
+    )
+    paper = L1Config.paper(0.04, epsilon=0.3)
+    assert assessment._columns(episodes, paper) == expected | {"switches_per_1000_steps": 50.0}
+
+
 def test_rows_are_there_for_each_disturbance_and_controller(table):
     found = {(row["bias"], row["delay"], row["l1"]) for row in table}
     controllers = ("off", "paper", "robust", "oracle")

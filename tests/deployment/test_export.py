@@ -3,11 +3,13 @@ from __future__ import annotations
 import sys
 import threading
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torchrl.envs import (
     ActionScaling,
@@ -19,9 +21,10 @@ from torchrl.envs import (
     StepCounter,
     TransformedEnv,
 )
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import IndependentNormal, ProbabilisticActor, TruncatedNormal
 
-from torchrl_l1.deployment import RobustController, export
+from torchrl_l1.deployment import Exported, RobustController, export
 from torchrl_l1.deployment.policies import load_policy
 from torchrl_l1.envs import environment_source
 
@@ -34,39 +37,70 @@ def with_policy(robust: RobustController, policy) -> RobustController:
     return RobustController(robust.source, acting, robust.model, robust.configs)
 
 
-@pytest.mark.parametrize("preset", ["robust", "paper"])
-def test_torchscript_acts_as_the_transform(robust, tmp_path, preset):
-    found = export(robust, tmp_path / "policy.pt", preset=preset, steps=30)
-    step = torch.jit.load(str(found.file))
+def loaded(found: Exported) -> Callable[..., Sequence[torch.Tensor]]:
+    """The function in a file, of observation and state in the order of ``found.inputs``."""
+    if found.file.suffix == ".pt":
+        return torch.jit.load(str(found.file))
+    if found.file.suffix == ".pt2":
+        return torch.export.load(str(found.file)).module()
+    session = pytest.importorskip("onnxruntime").InferenceSession(str(found.file))
+    assert tuple(one.name for one in session.get_outputs()) == found.outputs
+    known = {one.name for one in session.get_inputs()}
+    assert known <= set(found.inputs)
+
+    def step(*values: torch.Tensor) -> list[torch.Tensor]:
+        named = zip(found.inputs, values, strict=True)
+        given = {name: value.numpy() for name, value in named if name in known}
+        return [torch.as_tensor(one) for one in session.run(list(found.outputs), given)]
+
+    return step
+
+
+def first_action(robust: RobustController, found: Exported, x: torch.Tensor) -> torch.Tensor:
+    """What a file does at the first of its steps, where L1 knows of no disturbance."""
+    state = robust.wrap(robust.source.one()).reset()["l1"]
+    entries = [state[name].reshape(1, -1) for name in found.inputs[1:]]
+    return loaded(found)(x[None], *entries)[0][0]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "preset", "has_policy"),
+    [
+        (".pt", "robust", True),
+        (".pt", "paper", True),
+        (".pt2", "robust", False),
+        (".onnx", "robust", True),
+    ],
+)
+def test_what_is_written_acts_as_the_transform(robust, tmp_path, suffix, preset, has_policy):
+    if suffix == ".onnx":
+        for name in ("onnx", "onnxscript", "onnxruntime"):
+            pytest.importorskip(name)
+    file = tmp_path / f"policy{suffix}"
+    found = export(robust, file, preset=preset, with_policy=has_policy, steps=30)
+    assert found.steps == 30 and found.error < 1e-5
+    leading = ("observation",) if has_policy else ("observation", "u_rl")
+    names = found.inputs[len(leading) :]
+    assert found.inputs == (*leading, *names)
+    step = loaded(found)
     env = robust.wrap(robust.source.single({"bias": 0.5}), preset)
     data = env.rollout(25, robust.policy)[0]
-    state = [data["l1", name][:1] for name in found.inputs[1:]]
+    state = [data["l1", name][:1] for name in names]
     assert not any(entry.any() for entry in state)  # it begins with zeros
     for row in data:
-        action, *state = step(row["observation"][None], *state)
+        given = (row["observation"], row["action"])[: len(leading)]
+        action, *state = step(*(value[None] for value in given), *state)
         torch.testing.assert_close(action[0], row["next", "l1", "u_exec"], atol=1e-5, rtol=0)
     for name, entry in zip(found.outputs[1:], state, strict=True):
         expected = data["next", "l1", name.removeprefix("next_")][-1]
         torch.testing.assert_close(entry[0], expected, atol=1e-4, rtol=1e-4)
 
 
-def test_exported_programs_can_do_without_the_policy(robust, tmp_path):
-    found = export(robust, tmp_path / "l1.pt2", with_policy=False, steps=10)
-    assert found.inputs[:2] == ("observation", "u_rl") and found.error < 1e-5
-
-
 def test_as_many_steps_are_named_as_were_compared(robust, tmp_path):
     """An episode ends before, after 100 steps at the latest."""
     found = export(robust, tmp_path / "policy.pt", steps=5000)
     data = robust.wrap(robust.source.one()).rollout(5000, robust.policy)
-    assert 1 <= found.steps <= 100 == max(100, data.shape[-1])
-
-
-def test_onnx_acts_as_the_original(robust, tmp_path):
-    for name in ("onnx", "onnxscript", "onnxruntime"):
-        pytest.importorskip(name)
-    found = export(robust, tmp_path / "policy.onnx", steps=20)
-    assert found.error < 1e-4
+    assert found.steps == data.shape[-1] <= 100
 
 
 @pytest.mark.parametrize(
@@ -173,11 +207,8 @@ def test_what_is_no_number_away_from_the_recorded_steps_is_no_agreement(
 def test_decisions_in_torch_are_written(robust, tmp_path):
     bang = with_policy(robust, lambda x: torch.where(x[..., 1:2] > 0.5, -1.0, 1.0))
     found = export(bang, tmp_path / "policy.pt", steps=3)
-    step = torch.jit.load(str(found.file))
-    state = robust.wrap(robust.source.one()).reset()["l1"]
-    entries = [state[name].reshape(1, -1) for name in found.inputs[1:]]
     for angle, expected in ((0.0, 1.0), (1.0, -1.0)):
-        action, *_ = step(torch.tensor([[0.0, angle, 0.0, 0.0]]), *entries)
+        action = first_action(robust, found, torch.tensor([0.0, angle, 0.0, 0.0]))
         assert action.item() == pytest.approx(expected, abs=1e-5)
 
 
@@ -192,8 +223,14 @@ def test_scripts_and_checks_of_distributions_are_written(robust, tmp_path):
     for policy in (f"torchscript:{tmp_path / 'script.pt'}", actor):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            found = export(with_policy(robust, policy), tmp_path / "policy.pt", steps=3)
+            acting = with_policy(robust, policy)
+            found = export(acting, tmp_path / "policy.pt", steps=3)
         assert found.error < 1e-5
+        for angle in (0.1, 0.7):
+            x = torch.tensor([0.0, angle, 0.0, 0.0])
+            with set_exploration_type(ExplorationType.DETERMINISTIC):
+                expected = acting.policy(TensorDict(observation=x))["action"]
+            torch.testing.assert_close(first_action(robust, found, x), expected)
 
 
 @pytest.mark.parametrize("suffix", [".pt2", ".onnx"])
@@ -283,3 +320,6 @@ def test_sampling_policies_export_their_mean(robust, tmp_path):
     )  # fmt: skip
     found = export(with_policy(robust, actor), tmp_path / "policy.pt", steps=10)
     assert found.error < 1e-5
+    x = torch.tensor([0.0, 0.1, 0.2, -0.3])
+    mean = actor.get_dist(TensorDict(observation=x)).mean
+    torch.testing.assert_close(first_action(robust, found, x), mean)

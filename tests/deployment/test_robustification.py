@@ -8,7 +8,7 @@ from torchrl.envs import EnvBase, GymEnv, TransformedEnv
 
 import torchrl_l1
 from torchrl_l1.control import L1Transform
-from torchrl_l1.deployment import robustify
+from torchrl_l1.deployment import robustification, robustify
 from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.envs import ActuatorBias, make_env
 
@@ -73,6 +73,21 @@ def test_recorded_data_take_the_place_of_collected_ones(form):
     assert quality.training + quality.validation == 299
     assert made.settings("paper").epsilon > 0
     assert made.model.residuals.calibrated
+
+
+@pytest.mark.filterwarnings("ignore:the model is too poor")
+@pytest.mark.parametrize(("given", "expected"), [(None, 50.0), (7.0, 7.0)])
+def test_the_papers_tolerance_is_that_of_a_rate_of_switches(given, expected, monkeypatch):
+    asked = []
+
+    def found(model, data, rate):
+        asked.append((data.numel(), rate))
+        return 0.125, rate
+
+    monkeypatch.setattr(robustification, "epsilon_for", found)
+    made = robustify("inverted_pendulum", balance, 60, switch_rate=given, fit=QUICK, **TINY)
+    assert made.settings("paper").epsilon == 0.125
+    assert asked == [(60, expected)]
 
 
 def test_data_of_another_environment_are_refused():

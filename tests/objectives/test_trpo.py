@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 from copy import deepcopy
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -17,7 +18,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl_l1.algorithms.policy import GaussianPolicy, make_actor
 from torchrl_l1.objectives import TRPOConfig, conjugate_gradient, gaussian_trpo_step, trpo_step
 from torchrl_l1.objectives.gaussian_trpo import _GaussianProblem
-from torchrl_l1.objectives.trpo import _AutogradProblem
+from torchrl_l1.objectives.trpo import _AutogradProblem, take_step
 
 
 @given(size=st.integers(1, 12), seed=st.integers(0, 1000))
@@ -242,3 +243,50 @@ def test_a_step_needs_no_gradients_around_it() -> None:
         trpo_step(actor, data, TRPOConfig())
     with pytest.raises(KeyError, match=r"TRPO found no 'advantage' in the data, only .*action"):
         trpo_step(actor, data.exclude("advantage"), TRPOConfig())
+
+
+class Parabola:
+    """Surrogate ``g.x - cost |x|^2`` and divergence ``x'Fx / 2``, times a factor, around zero."""
+
+    slope, fisher = torch.tensor([3.0, -1.0]).double(), torch.tensor([1.0, 4.0]).double()
+
+    def __init__(self, cost: float, factor: float) -> None:
+        self.parameters = [torch.zeros(2).double()]
+        self.cost, self.factor = cost, factor
+
+    def gradient(self) -> torch.Tensor:
+        return self.slope
+
+    def fisher_product(self, vector: torch.Tensor) -> torch.Tensor:
+        return self.fisher * vector
+
+    def evaluate(self) -> tuple[torch.Tensor, torch.Tensor]:
+        (x,) = self.parameters
+        gain = self.slope @ x - self.cost * x @ x
+        return gain, self.factor * x @ self.fisher_product(x) / 2
+
+
+@pytest.mark.parametrize("binding", ["surrogate", "divergence"])
+@pytest.mark.parametrize("backtracks", [0, 1, 3])
+def test_the_step_is_the_first_on_the_ray_that_keeps_both_conditions(
+    binding: str, backtracks: int
+) -> None:
+    slope, fisher = Parabola.slope.numpy(), Parabola.fisher.numpy()
+    max_kl, damping, accept_ratio = 0.02, 0.5, 0.3
+    direction = slope / (fisher + damping)
+    edge = np.sqrt(2 * max_kl / (direction @ ((fisher + damping) * direction))) * direction
+    # Where candidate 0.81 times the edge would be the longest to pass, 0.8 is, and so on.
+    longest = 1.01 * 0.8**backtracks
+    cost = factor = 0.0
+    if binding == "surrogate":
+        cost = (1 - accept_ratio) * (slope @ edge) / (longest * edge @ edge)
+    else:
+        factor = max_kl / (longest**2 * edge @ (fisher * edge) / 2)
+    problem = Parabola(cost, factor)
+    config = TRPOConfig(max_kl=max_kl, damping=damping, accept_ratio=accept_ratio)
+    report = take_step(problem, torch.ones(1), config)
+    x = 0.8**backtracks * edge
+    np.testing.assert_allclose(problem.parameters[0].numpy(), x, rtol=1e-9)
+    assert report.accepted and report.backtracks == backtracks
+    assert report.improvement == pytest.approx(slope @ x - cost * x @ x)
+    assert report.kl == pytest.approx(factor * x @ (fisher * x) / 2)
