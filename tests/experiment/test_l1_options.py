@@ -7,7 +7,8 @@ import pytest
 from omegaconf import DictConfig
 
 from torchrl_l1.control import L1Config, L1Transform
-from torchrl_l1.experiment.evaluate import evaluate, load_run, make_collection
+from torchrl_l1.envs import get_task
+from torchrl_l1.experiment.evaluate import check_controllers, evaluate, load_run, make_collection
 from torchrl_l1.experiment.l1_options import (
     closest_option,
     departures,
@@ -99,6 +100,11 @@ def test_values_that_a_test_sets_take_the_place_of_the_runs_own(tiny_recipe: Rec
         assert (config.epsilon, config.filter_gain, config.a_s) == pytest.approx(
             (epsilon, gain, a_s)
         )
+
+
+def test_the_robust_controller_has_no_epsilon_of_the_run() -> None:
+    """One that could not be used anywhere else is nothing to it."""
+    check_controllers(L1Settings(epsilon=-3.0), get_task("swimmer"), [Condition("robust")])
 
 
 def test_controllers_that_are_off_are_the_same() -> None:
