@@ -157,7 +157,15 @@ def read_npz(
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such file") from None
     except Exception as error:
-        raise ValueError(f"{path} is no readable .npz file: {error}") from None
+        why: object = error
+        if "Object arrays" in str(error):
+            why = (
+                "it has arrays of objects, which are pickles: save arrays of numbers, episodes one "
+                "after the other, and an array that numbers them"
+            )
+        elif "pickle" in str(error):  # what NumPy takes all else for
+            why = "numpy.savez did not write it"
+        raise ValueError(f"{path} is no readable .npz file: {why}") from None
 
     def array(name: str) -> np.ndarray:
         if name not in arrays:
@@ -272,7 +280,7 @@ def _columns(
     Those too that tell the ends of episodes, and what followed an observation.
     """
     if not Path(path).is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+        raise FileNotFoundError(f"{path}: no such file{', but a folder' * Path(path).is_dir()}")
     if len(delimiter) != 1:
         raise ValueError(f"{path}: the delimiter is one character, like '\\t', got {delimiter!r}")
     # A byte order mark is none of the first column's name.
@@ -280,12 +288,16 @@ def _columns(
         # Spaces after a delimiter keep quotes from being seen, and are themselves delimiters.
         lines = csv.reader(file, delimiter=delimiter, skipinitialspace=True)
         header = [name.strip() for name in next(filter(None, lines), [])]
+        if any("\0" in name for name in header):
+            raise ValueError(f"{path} is no text: save the table as CSV")
         if header:
             header[0] = header[0].removeprefix("#").strip()
         for name in wanted:
             if name not in header:
                 there = ", ".join(header) or "no first line"
                 hint = "" if len(header) > 1 else f", cells taken to be apart by {delimiter!r}"
+                other = next((mark for mark in (";", "\t", ",") if hint and mark in there), None)
+                hint += f"; give delimiter={other!r}" if other else ""
                 raise KeyError(f"{path} has no column {name!r}, only {there}{hint}")
             if header.count(name) > 1:
                 raise ValueError(f"{path} has {header.count(name)} columns {name!r}: rename them")
