@@ -107,6 +107,8 @@ def typed_override(key: str, value: str) -> str:
 
 def _of_override(text: str, override: str) -> str:
     """Hydra's words with the override that they are of, and without a link to its grammar."""
+    if "=" not in override:
+        return f"{override!r} is no override: write KEY=VALUE, such as seed=3"
     text = re.split(r"\s*See https://hydra", text)[0]
     where = "" if override in text else f"{override}: "
     key, _, value = override.partition("=")
