@@ -134,6 +134,12 @@ def test_columns_padded_with_spaces(tmp_path: Path, delimiter: str, lines: list[
             ValueError,
             "line 2, column 'rate': '0,5' is no number; decimals stand behind a point",
         ),
+        (
+            ["angle,rate,torque,t", "0,0,0,2024-03-01T10:00:00"],
+            {"time": "t"},
+            ValueError,
+            "column 't': '2024-03-01T10:00:00' is no number; a time is a number of seconds",
+        ),
         (["angle,rate,torque", "0,1_000,0"], {}, ValueError, "'1_000' is no number"),
         (
             # As R writes it, with the names of the rows; and with decimal commas.

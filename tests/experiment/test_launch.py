@@ -136,6 +136,7 @@ def test_a_key_that_no_schema_knows_is_refused_with_a_plus_too(
         (["task=a=b"], "task=a=b: mismatched input '='"),
         (["task=a=b"], "has quotes of its own: 'task=\"a=b\"'"),
         (["l1=[off"], "[off"),
+        (["loggers=wandb"], "(write it as a list, [a,b])"),
         (["seed=0,1"], "Ambiguous value"),
         (["~nothing"], "does not exist"),
         (["label=both"], "label must be"),

@@ -324,11 +324,11 @@ def _columns(
                     try:
                         columns[name].append(_number(cell))
                     except ValueError:
-                        remedy = (
-                            "decimals stand behind a point"
-                            if re.fullmatch(r"[-+]?\d*,\d+", cell)
-                            else "where there is no value, the cell is empty"
-                        )
+                        remedy = "where there is no value, the cell is empty"
+                        if re.fullmatch(r"[-+]?\d*,\d+", cell):
+                            remedy = "decimals stand behind a point"
+                        elif re.search(r"\d:\d", cell):
+                            remedy = "a time is a number of seconds"
                         raise ValueError(
                             f"{path}, line {lines.line_num}, column {name!r}: {cell!r} is no "
                             f"number; {remedy}"

@@ -132,5 +132,6 @@ def _of_hydra(text: str, cause: str) -> str:
         for line in lines
         if line and not line.startswith(("To append", "full_key: ", "object_type="))
     ]
+    kept += ["(write it as a list, [a,b])"] if "is not a ListConfig" in f"{text}{cause}" else []
     where = f"{place[1]}: " if place and place[1] not in " ".join([*kept, cause]) else ""
     return where + " ".join([*kept, cause])
