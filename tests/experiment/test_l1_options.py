@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from omegaconf import DictConfig
@@ -18,7 +19,7 @@ from torchrl_l1.experiment.l1_options import (
 )
 from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.settings import L1Settings
+from torchrl_l1.experiment.settings import L1Settings, l1_config
 
 Recipe = Callable[..., DictConfig]
 
@@ -100,6 +101,21 @@ def test_values_that_a_test_sets_take_the_place_of_the_runs_own(tiny_recipe: Rec
         assert (config.epsilon, config.filter_gain, config.a_s) == pytest.approx(
             (epsilon, gain, a_s)
         )
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("epsilon", -3), ("alpha", 7), ("filter", "kalmn"), ("process_noise", -1), ("a_s", 1)],
+)
+def test_settings_of_a_controller_that_is_off_are_checked(name: str, value: Any) -> None:
+    """Evaluations turn it on: what no controller can have would be found after the training."""
+    with pytest.raises(ValueError, match=name):
+        l1_config(L1Settings(**{name: value}), "swimmer")
+
+
+def test_a_controller_that_is_off_may_be_tuned_for_any_other() -> None:
+    for settings in ({"process_noise": 0.02, "alpha": 0.1}, {"cutoff": 90.0}):
+        assert l1_config(L1Settings(**settings), "swimmer") is None
 
 
 def test_the_robust_controller_has_no_epsilon_of_the_run() -> None:

@@ -13,7 +13,6 @@ import json
 import os
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hydra.errors import HydraException
@@ -34,7 +33,6 @@ from torchrl_l1.experiment.recipes import (
     recipes_dir,
 )
 from torchrl_l1.experiment.settings import (
-    L1Settings,
     METRPORecipe,
     PETSRecipe,
     RunSettings,
@@ -188,21 +186,6 @@ def test_cutoff_or_alpha_but_not_both() -> None:
     recipe = typed("metrpo/inverted_pendulum", "l1.cutoff=5.0", "l1.alpha=0.1")
     with pytest.raises(ValueError, match="cutoff"):
         l1_config(recipe.l1, recipe.task)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("epsilon", -3), ("alpha", 7), ("filter", "kalmn"), ("process_noise", -1), ("a_s", 1)],
-)
-def test_settings_of_a_controller_that_is_off_are_checked(name: str, value: Any) -> None:
-    """Evaluations turn it on: what no controller can have would be found after the training."""
-    with pytest.raises(ValueError, match=name):
-        l1_config(L1Settings(**{name: value}), "swimmer")
-
-
-def test_a_controller_that_is_off_may_be_tuned_for_any_other() -> None:
-    for settings in ({"process_noise": 0.02, "alpha": 0.1}, {"cutoff": 90.0}):
-        assert l1_config(L1Settings(**settings), "swimmer") is None
 
 
 def test_a_users_own_recipe_builds_on_the_shipped_groups(tmp_path: Path) -> None:
