@@ -25,7 +25,7 @@ from torchrl.envs import (
     VecNormV2,
 )
 
-from torchrl_l1.control import L1Controller, L1Transform
+from torchrl_l1.control import L1Config, L1Controller, L1Transform
 from torchrl_l1.dynamics import EnsembleDynamics
 from torchrl_l1.envs import BatchedMujocoEnv
 
@@ -156,7 +156,17 @@ def test_actions_in_other_units_than_those_of_the_fit_are_noticed():
     with pytest.warns(UserWarning, match="other units"):
         env.rollout(1, TensorDictSequential(policy, controller))
     wrapped(L1Transform(ensemble, dt=0.04), ActionScaling()).reset()
+    # A policy may send a little more than what arrives, but not by the units of a scaling.
+    ensemble.fit_statistics(torch.randn(500, 4), 4 * torch.rand(500, 1) - 2, torch.randn(500, 4))
+    with pytest.warns(UserWarning, match="other units"):
+        wrapped().reset()
+    wrapped(L1Transform(ensemble, dt=0.04, action_low=-1, action_high=1)).reset()
     # Of all actions within the bounds those at their ends have the largest deviation.
     ends = 1 - 2 * torch.randint(2, (500, 1)).float()
     ensemble.fit_statistics(torch.randn(500, 4), ends, torch.randn(500, 4))
     wrapped().reset()
+
+
+def test_a_second_argument_of_another_type_is_named_and_not_printed():
+    with pytest.raises(TypeError, match="L1Config as its second argument, got EnsembleDynamics:"):
+        L1Transform(L1Config(0.04), EnsembleDynamics(4, 1, members=2, hidden=(8,)))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -117,6 +118,8 @@ def test_the_table_is_markdown(table):
     ]
     assert len({line.count("|") for line in lines}) == 1
     assert "3 episodes" in table.words
+    single = replace(table, rows=[{**row, "episodes": 1} for row in table.rows])
+    assert "of 1 episode [lowest" in single.words
 
 
 def test_suites_leave_out_what_cannot_act():

@@ -83,6 +83,7 @@ def test_from_a_policy_to_a_controller_that_python_loads(policy_file, tmp_path, 
         ("robustify hopper --policy sb3:x.zip", "no file x.zip"),
         ("robustify hopper --policy p --suite quick --bias 1", "--suite or --bias, not both"),
         ("robustify CartPole-v1 --policy sb3:x.zip --dt 0.02", "continuous actions"),
+        ("robustify hopper --policy nofile.pt --output out/here", "nofile.pt"),
         ("play nowhere", "no folder nowhere"),
         ("play hopper --output film.avi", "must end in"),
         ("export nowhere file.pt", "no folder nowhere"),
@@ -91,6 +92,7 @@ def test_from_a_policy_to_a_controller_that_python_loads(policy_file, tmp_path, 
 def test_refusals_of_one_line(line, message, capsys, monkeypatch):
     monkeypatch.setenv("DISPLAY", ":0")
     assert message in refused(shlex.split(line), capsys)
+    assert not Path("out").exists() and not Path("runs").exists()
 
 
 @pytest.mark.parametrize(

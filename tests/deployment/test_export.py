@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import NormalParamExtractor, TensorDictModule
+from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
 from torchrl.envs import (
     ActionScaling,
     CatTensors,
@@ -22,7 +22,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import IndependentNormal, ProbabilisticActor, TruncatedNormal
+from torchrl.modules import GRUModule, IndependentNormal, ProbabilisticActor, TruncatedNormal
 
 from torchrl_l1.deployment import Exported, RobustController, export
 from torchrl_l1.deployment.policies import load_policy
@@ -154,6 +154,17 @@ def test_what_is_not_made_of_torchs_operations_is_refused(robust, tmp_path):
     with pytest.raises(ValueError, match="without-policy"):
         export(numpy, tmp_path / "policy.pt", steps=10)
     assert export(numpy, tmp_path / "l1.pt", with_policy=False, steps=10).error < 1e-5
+
+
+def test_policies_with_a_memory_are_refused_for_what_they_are(robust, tmp_path):
+    """Before anything is traced: neither another format nor a primer would help."""
+    memory = GRUModule(4, 2, in_key="observation", out_key="hidden")
+    actor = TensorDictModule(torch.nn.Linear(2, 1), ["hidden"], ["action"])
+    acting = replace(robust, policy=TensorDictSequential(memory, actor))
+    with pytest.raises(
+        ValueError, match=r"remembers something .* no file holds that: export L1 al"
+    ):
+        export(acting, tmp_path / "policy.pt", steps=10)
 
 
 def decides(x):
@@ -306,7 +317,7 @@ def test_files_of_the_policy_are_not_replaced(robust, tmp_path, monkeypatch):
 
 
 def test_other_suffixes_are_refused(robust, tmp_path):
-    with pytest.raises(ValueError, match="format"):
+    with pytest.raises(ValueError, match=r"policy.json must end in .pt, .ts, .onnx, .pt2, or form"):
         export(robust, tmp_path / "policy.json")
 
 

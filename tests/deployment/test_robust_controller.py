@@ -45,7 +45,7 @@ def test_what_is_saved_acts_the_same(robust, policy_file, tmp_path):
     assert torch.equal(first["next", "l1", "u_exec"], second["next", "l1", "u_exec"])
     assert loaded.configs == robust.configs and loaded.preset == robust.preset
     assert load_target(str(tmp_path), trusted=True).configs == robust.configs
-    with pytest.raises(ValueError, match="say --trust"):
+    with pytest.raises(ValueError, match="say --trust, in Python trusted=True, if"):
         load_target(str(tmp_path))
 
 

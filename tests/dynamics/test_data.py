@@ -114,7 +114,13 @@ def test_columns_padded_with_spaces(tmp_path: Path, delimiter: str, lines: list[
     ("lines", "options", "error", "message"),
     [
         (["angle,rate", "0,0"], {}, KeyError, "no column 'torque', only angle, rate"),
-        (["angle;rate;torque", "0;0;0"], {}, KeyError, "only angle;rate;torque, cells .* by ','"),
+        (
+            ["angle;rate;torque", "0;0;0"],
+            {},
+            KeyError,
+            "only angle;rate;torque, cells .* by ','; give delimiter=';'",
+        ),
+        (["PAR1\0\0\0"], {}, ValueError, "is no text: save the table as CSV"),
         ([], {}, KeyError, "no first line"),
         (
             ["angle,rate,torque", "0,0,0", "0,off,0"],
@@ -127,6 +133,12 @@ def test_columns_padded_with_spaces(tmp_path: Path, delimiter: str, lines: list[
             {"delimiter": ";"},
             ValueError,
             "line 2, column 'rate': '0,5' is no number; decimals stand behind a point",
+        ),
+        (
+            ["angle,rate,torque,t", "0,0,0,2024-03-01T10:00:00"],
+            {"time": "t"},
+            ValueError,
+            "column 't': '2024-03-01T10:00:00' is no number; a time is a number of seconds",
         ),
         (["angle,rate,torque", "0,1_000,0"], {}, ValueError, "'1_000' is no number"),
         (
@@ -200,6 +212,8 @@ def test_names_of_episodes_that_come_back_begin_new_ones(tmp_path: Path) -> None
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"log\.csv: no such file"):
         read_csv(tmp_path / "log.csv", **KEYS)
+    with pytest.raises(FileNotFoundError, match=r"no such file, but a folder"):
+        read_csv(tmp_path, **KEYS)
     with pytest.raises(FileNotFoundError, match=r"log\.npz: no such file"):
         read_npz(tmp_path / "log.npz", **KEYS)
 
@@ -243,8 +257,14 @@ def test_arrays_that_do_not_fit(
 
 def test_other_files_are_no_archives_of_arrays(tmp_path: Path) -> None:
     write(tmp_path / "log.npz", "angle,rate")
-    with pytest.raises(ValueError, match=r"log.npz is no readable .npz file"):
+    with pytest.raises(
+        ValueError, match=r"log.npz is no readable .npz file: numpy.savez did not w"
+    ):
         read_npz(tmp_path / "log.npz", observation="x", action="u")
+    ragged = np.array([np.zeros(2), np.zeros(3)], dtype=object)
+    np.savez(tmp_path / "ragged.npz", x=ragged, u=ragged)
+    with pytest.raises(ValueError, match=r"arrays of objects, .* an array that numbers them"):
+        read_npz(tmp_path / "ragged.npz", observation="x", action="u")
     np.save(tmp_path / "log.npy", np.zeros(3))
     with pytest.raises(ValueError, match=r"single array; save several by name with numpy.savez"):
         read_npz(tmp_path / "log.npy", observation="x", action="u")

@@ -129,3 +129,62 @@ def test_arrays_of_flags_may_lie_on_their_side_and_have_the_name_of_a_measuremen
         read_npz(file, **keys)
     np.savez(file, **columns, done=np.where(ends == 1, 1.0, np.nan))
     assert len(read_npz(file, observation="angle", action="torque", episode="part")) == 4
+
+
+def buffer(order: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two episodes as a replay buffer has them: observations, what followed, and numbers."""
+    x = np.random.default_rng(0).normal(size=(2, 21, 2)).cumsum(1)
+    rows = x[:, :-1].reshape(-1, 2), x[:, 1:].reshape(-1, 2), np.arange(2).repeat(20)
+    return rows[0][order], rows[1][order], rows[2][order]
+
+
+IN_ORDER = np.arange(40)
+SHUFFLED = np.random.default_rng(1).permutation(40)
+
+
+@pytest.mark.parametrize(
+    ("order", "episode", "count"),
+    [(SHUFFLED, None, 39), (SHUFFLED, "number", 38), (IN_ORDER[::2], "number", 18)],
+)
+@pytest.mark.parametrize("name", ["next_observations", "next_obs", "observation_next"])
+def test_rows_that_do_not_follow_each_other_are_no_transitions(
+    tmp_path: Path, order: np.ndarray, episode: str | None, count: int, name: str
+) -> None:
+    """A replay buffer's, shuffled or thinned out: between two of them lies no step of the plant."""
+    x, following, number = buffer(order)
+    u = np.ones(len(x))
+    rows = [f"{a},{b},1,{c},{n}" for (a, b), (c, _), n in zip(x, following, number, strict=True)]
+    table = write(tmp_path / "log.csv", "angle,rate,torque,next_angle,number", *rows)
+    arrays = {"observation": x, "action": u, "angle": x[:, 0], "rate": x[:, 1], "number": number}
+    np.savez(tmp_path / "log.npz", **arrays, **{name: following})
+    whole = {"observation": "observation", "action": "action"}
+    parts = {"observation": ["angle", "rate"], "action": "action"}
+    for read, file, keys in (
+        (read_csv, table, KEYS),
+        (read_npz, tmp_path / "log.npz", whole),
+        (read_npz, tmp_path / "log.npz", parts),
+    ):
+        with pytest.raises(ValueError, match=rf"which is not what stands.* \d+ times of {count}:"):
+            read(file, **keys, episode=episode)
+
+
+def test_what_followed_may_stand_beside_rows_in_order(tmp_path: Path) -> None:
+    """Also rounded, unknown, in the last row of an episode, or one row short."""
+    x, following, number = buffer(IN_ORDER)
+    rows = [
+        f"{a!r},{b!r},1,{'' if i == 3 else repr(c)},{n}"
+        for i, ((a, b), (c, _), n) in enumerate(
+            zip(x.tolist(), following.tolist(), number, strict=True)
+        )
+    ]
+    table = write(tmp_path / "log.csv", "angle,rate,torque,next_angle,number", *rows)
+    assert len(read_csv(table, **KEYS, episode="number")) == 38
+    np.savez(
+        tmp_path / "log.npz",
+        observations=x[:20],
+        action=np.ones(19),
+        next_observations=following[:19].astype(np.float32),
+    )
+    assert len(read_npz(tmp_path / "log.npz", observation="observations", action="action")) == 19
+    with pytest.raises(ValueError, match=r"'next_angle', which is not .* 1 times of 39: .*episode"):
+        read_csv(table, **KEYS)

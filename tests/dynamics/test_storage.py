@@ -140,6 +140,10 @@ def test_other_files_are_told(kind: str, tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError if missing else ValueError, match="model") as caught:
         EnsembleDynamics.load(file)
     assert "\n" not in str(caught.value)
+    if kind == "torch":  # as the model.pt of a run is
+        assert "the model of a run is torchrl_l1.deployment.load_target(RUN_DIR)" in str(
+            caught.value
+        )
 
 
 def test_others_can_read_the_tensors(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from torchrl_l1.envs import (
     make_env,
     wind_force,
 )
+from torchrl_l1.envs.plant import cannot_change
 
 CHANGES = {
     "payload": 0.3,
@@ -229,6 +230,12 @@ def test_wind_blows_on_after_partial_resets():
     env.reset(TensorDict({"_reset": torch.tensor([[True], [False]])}, batch_size=[2]))
     env.rand_step(env.reset())
     np.testing.assert_array_equal(forces, expected)
+
+
+def test_what_can_be_given_a_wind_is_named():
+    words = "wind changes the plant, which needs a task of ours, not mine.py:f: leave it out"
+    assert cannot_change("mine.py:f", "wind") == words
+    assert "a task of ours or one of Gymnasium's MuJoCo environments" in cannot_change("f", "mass")
 
 
 def test_refusals():

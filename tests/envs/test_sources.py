@@ -49,6 +49,15 @@ def test_functions_of_files(tmp_path):
     assert source.time_step() == pytest.approx(0.04)
 
 
+def test_a_function_that_needs_arguments_is_named(tmp_path):
+    file = tmp_path / "own.py"
+    file.write_text("def make_env(size):\n    return size\n\n\ndef fails():\n    return len(3)\n")
+    with pytest.raises(ValueError, match=r"own.py:make_env cannot be called .* 'size'\): give"):
+        environment_source(f"{file}:make_env").one()
+    with pytest.raises(TypeError, match="has no len"):  # of its own it is told as it is
+        environment_source(f"{file}:fails").one()
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [

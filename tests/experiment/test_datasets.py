@@ -186,6 +186,9 @@ def test_a_table_needs_names() -> None:
     np.savez("drive.npz", **arrays)
     data = read_dataset("drive.npz", DatasetColumns(["x"], ["u"], episode="run"))
     assert data["observation"].flatten().tolist() == [0, 1, 3, 4]
+    np.savez("buffer.npz", observations=np.array([0.0, 5, 2]), u=np.zeros(3), next_obs=np.arange(3))
+    with pytest.raises(ValueError, match="has 'next_obs', which is not what stands in the next"):
+        read_dataset("buffer.npz", DatasetColumns(["observations"], ["u"]))
 
 
 def test_a_run_s_real_transitions(tiny_recipe: Callable[..., DictConfig]) -> None:

@@ -2,12 +2,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from omegaconf import DictConfig
 
 from torchrl_l1.control import L1Config, L1Transform
-from torchrl_l1.experiment.evaluate import evaluate, load_run, make_collection
+from torchrl_l1.envs import get_task
+from torchrl_l1.experiment.evaluate import check_controllers, evaluate, load_run, make_collection
 from torchrl_l1.experiment.l1_options import (
     closest_option,
     departures,
@@ -17,7 +19,7 @@ from torchrl_l1.experiment.l1_options import (
 )
 from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.experiment.run import run
-from torchrl_l1.experiment.settings import L1Settings
+from torchrl_l1.experiment.settings import L1Settings, l1_config
 
 Recipe = Callable[..., DictConfig]
 
@@ -99,6 +101,26 @@ def test_values_that_a_test_sets_take_the_place_of_the_runs_own(tiny_recipe: Rec
         assert (config.epsilon, config.filter_gain, config.a_s) == pytest.approx(
             (epsilon, gain, a_s)
         )
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("epsilon", -3), ("alpha", 7), ("filter", "kalmn"), ("process_noise", -1), ("a_s", 1)],
+)
+def test_settings_of_a_controller_that_is_off_are_checked(name: str, value: Any) -> None:
+    """Evaluations turn it on: what no controller can have would be found after the training."""
+    with pytest.raises(ValueError, match=name):
+        l1_config(L1Settings(**{name: value}), "swimmer")
+
+
+def test_a_controller_that_is_off_may_be_tuned_for_any_other() -> None:
+    for settings in ({"process_noise": 0.02, "alpha": 0.1}, {"cutoff": 90.0}):
+        assert l1_config(L1Settings(**settings), "swimmer") is None
+
+
+def test_the_robust_controller_has_no_epsilon_of_the_run() -> None:
+    """One that could not be used anywhere else is nothing to it."""
+    check_controllers(L1Settings(epsilon=-3.0), get_task("swimmer"), [Condition("robust")])
 
 
 def test_controllers_that_are_off_are_the_same() -> None:

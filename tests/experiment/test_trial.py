@@ -58,6 +58,12 @@ class Micro(gymnasium.Env):
         return self.state.astype(np.float32), -1e6 * abs(float(self.state[0])), False, False, {}
 
 
+class Lost(Odd):
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        return observation, np.nan, *rest
+
+
 def wrong(observation, action, next_observation):
     return next_observation[..., 0] + 3.0
 
@@ -131,6 +137,17 @@ def test_all_that_is_odd_is_named(place: Path, capsys: pytest.CaptureFixture[str
     assert "the same seed gives the same episodes" in said
 
 
+def test_an_environment_without_a_finite_reward_is_named(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["check", "pets/any", "task=odd.py:Lost", "horizon=9", "reward=odd.py:wrong"]
+    with pytest.raises(SystemExit):
+        main([*command, "termination=none", "--steps", "20"])
+    said = capsys.readouterr().out
+    assert "16 of 16 steps gave observations or rewards that are not finite" in said
+    assert "1 thing to fix" in said
+
+
 def test_units_that_are_too_large_are_named(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -150,6 +167,7 @@ def test_what_will_not_do_is_a_line(place: Path, capsys: pytest.CaptureFixture[s
     for arguments, words in (
         (["new-task", "a.txt", "--from", "gymnasium/Pendulum-v1"], "must end in .yaml"),
         (["new-task", "a.yaml", "--from", "odd.py:make_env"], "give horizon=STEPS"),
+        (["new-task", "a.yaml", "--from", "odd.py:make_env"], "; here --horizon STEPS"),
         (["check", "pets/any", "task=gymnasium/CartPole-v1"], "Discrete(2) as actions"),
         (["check", "pets/any", "--steps", "9", "task=gymnasium/Pendulum-v1"], "at least 10, got 9"),
     ):

@@ -222,6 +222,7 @@ def _runs(index: int, matrix: RunMatrix, output: Path, trusted: bool) -> Iterato
         overrides = [*matrix.overrides, *place, f"run_dir={quoted(folder)}"]
         config = compose(recipe, overrides, trusted=trusted)
         _check(config)
+        _check_varied(matrix, config)
         for round_, seed in enumerate(matrix.matrix["seed"]):
             own = config.copy()
             own.seed = seed
@@ -241,6 +242,17 @@ def _check(config: DictConfig) -> None:
     # What is drawn for weights is of no use; the global numbers go on as if nothing had been.
     with fork_rng(devices=[]), single_precision(), fitting_into_memory(recipe.recipe):
         recipe.build_on_cpu()
+
+
+def _check_varied(matrix: RunMatrix, config: DictConfig) -> None:
+    """Refuse settings of L1 that tell runs without it apart: those would all be the same."""
+    for key, values in matrix.matrix.items():
+        of_l1 = key.startswith("l1.") and key != "l1.enabled"
+        if of_l1 and len(values) > 1 and not config.l1.enabled:
+            raise CampaignError(
+                f"matrix.{key} changes nothing while L1 is off: turn it on by l1=paper in "
+                "overrides, or give the runs without L1 a matrix of their own"
+            )
 
 
 def check_machine(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:

@@ -16,6 +16,13 @@ from torchrl_l1.experiment.trial import describe
 
 ALGORITHMS = ("pets", "dets", "metrpo", "mbmf")
 
+# What a recipe would say, and what is said here.
+_OPTIONS = {
+    "dt=": "--dt SECONDS",
+    "horizon=": "--horizon STEPS",
+    "observation_keys=": "--observation-keys PART PART",
+}
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``torchrl-l1 new-task``."""
@@ -53,13 +60,17 @@ def new_task_command(options: argparse.Namespace) -> None:
     if options.horizon is not None:
         check_count("--horizon", options.horizon)
     folders = folders_of([options.source], [file.parent, Path.cwd()])
-    task = get_task(
-        options.source,
-        dt=options.dt,
-        horizon=options.horizon,
-        observation_keys=options.observation_keys,
-        search_path=folders,
-    )
+    try:
+        task = get_task(
+            options.source,
+            dt=options.dt,
+            horizon=options.horizon,
+            observation_keys=options.observation_keys,
+            search_path=folders,
+        )
+    except ValueError as error:
+        here = [option for setting, option in _OPTIONS.items() if setting in str(error)]
+        raise ValueError(f"{error}{f'; here {here[0]}' if here else ''}") from error
     for line in describe(task):
         print(line)
     file.parent.mkdir(parents=True, exist_ok=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -93,24 +94,32 @@ def robustify_command(options: argparse.Namespace) -> None:
     if output.exists() and not output.is_dir():
         raise ValueError(f"{output} is a file; choose another --output")
     made_of = (options.env, options.policy, options.normalization, options.weights)
-    check_replaces(output / "controller", *made_of)
+    controller = output / "controller"
+    check_replaces(controller, *made_of)
     _check_results(output)
+    fresh = [folder for folder in (controller, *controller.parents) if not folder.exists()]
     make_folder(output)
-    make_folder(output / "controller")
-    robust = robustify(
-        options.env,
-        options.policy,
-        options.steps,
-        preset=options.preset,
-        dt=options.dt,
-        epsilon=options.epsilon,
-        normalization=options.normalization,
-        weights=options.weights,
-        noise=options.noise,
-        seed=options.seed,
-    )
+    make_folder(controller)
+    try:
+        robust = robustify(
+            options.env,
+            options.policy,
+            options.steps,
+            preset=options.preset,
+            dt=options.dt,
+            epsilon=options.epsilon,
+            normalization=options.normalization,
+            weights=options.weights,
+            noise=options.noise,
+            seed=options.seed,
+        )
+    except BaseException:
+        with suppress(OSError):  # another one may have begun to write there
+            for folder in fresh:
+                folder.rmdir()
+        raise
     # At once: a test that is broken off need not cost the controller.
-    folder = robust.save(output / "controller")
+    folder = robust.save(controller)
     table = robust.evaluate(
         disturbances or _some_biases(robust),
         episodes=options.episodes,

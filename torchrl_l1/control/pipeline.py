@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import (
+    ActionScaling,
     Compose,
     ConditionalPolicySwitch,
     DeviceCastTransform,
@@ -34,8 +35,9 @@ from torchrl_l1.control.step_time import time_step
 
 _TOLERANCE = 1e-4
 
-# Actions of a policy that does not keep to the bounds may be a little beyond them.
-_FAR = 1.5
+# Actions of a policy that does not keep to the bounds may be a little beyond them; where an
+# action is scaled, other units are likelier.
+_FAR, _FAR_WHERE_SCALED = 1.5, 1.05
 
 # In place of a time step that is not known yet: so short that no setting is too fast for it.
 _SHORT = 1e-6
@@ -235,8 +237,8 @@ class Settings:
         self.owner = owner
         if config is not None and not isinstance(config, L1Config):
             raise TypeError(
-                f"{owner} takes an L1Config as its second argument, got {config!r}: give settings "
-                "by name, as dt=0.05, or as L1Config(...)"
+                f"{owner} takes an L1Config as its second argument, got {type(config).__name__}: "
+                "give settings by name, as dt=0.05, or as L1Config(...)"
             )
         if config is not None:
             given = [name for name, value in {"dt": dt, **others}.items() if value is not None]
@@ -329,11 +331,25 @@ def warn_of_surroundings(
         )
 
 
-def warn_of_action_units(dynamics: object, low: Scalars | None, high: Scalars | None) -> None:
+def scales_actions(env: EnvBase) -> bool:
+    """Whether an ``ActionScaling`` gives the action of an environment other units."""
+    found = [one for one in transforms_of(env) if isinstance(one, ActionScaling)]
+    return any(bool((one.scale != 1).any() or (one.loc != 0).any()) for one in found)
+
+
+def warn_of_action_units(
+    dynamics: object, low: Scalars | None, high: Scalars | None, scaled: bool = False
+) -> None:
     """Say so where a model has been fitted to actions far beyond the bounds of L1.
 
     The data's mean and deviation tell: from the middle of the bounds their root mean square is at
     most half the range, whatever the actions within are.
+
+    Args:
+        dynamics: the model.
+        low: lower bound.
+        high: upper bound.
+        scaled: whether the action is scaled on its way to the plant, see :func:`scales_actions`.
     """
     normalizer = getattr(dynamics, "action_normalizer", None)
     mean, std = getattr(normalizer, "mean", None), getattr(normalizer, "std", None)
@@ -346,7 +362,8 @@ def warn_of_action_units(dynamics: object, low: Scalars | None, high: Scalars | 
     if not all(bound.ndim == 0 or bound.shape == mean.shape for bound in (bottom, top)):
         return
     size = (std.square() + (mean - (bottom + top) / 2).square()).sqrt()
-    beyond = (size > _FAR * (top - bottom) / 2) & size.isfinite()
+    far = _FAR_WHERE_SCALED if scaled else _FAR
+    beyond = (size > far * (top - bottom) / 2) & size.isfinite()
     if beyond.any():
         warnings.warn(
             f"{describe(dynamics)} was fitted to actions far beyond the bounds of L1, in the "

@@ -31,6 +31,7 @@ from torchrl_l1.control.pipeline import (
     carry,
     check_order,
     check_resets,
+    scales_actions,
     unspecified,
     warn_of_action_units,
     warn_of_surroundings,
@@ -379,7 +380,8 @@ class L1Transform(Transform):
         spec = layout.low, layout.high
         warn_of_surroundings("L1Transform", parent, self.observation_key, bounds, spec)
         config = layout.bounded(config)
-        warn_of_action_units(self.model.dynamics, config.action_low, config.action_high)
+        limits, scaled = (config.action_low, config.action_high), scales_actions(parent)
+        warn_of_action_units(self.model.dynamics, *limits, scaled)
         if self._step_function is None or config != self._step_config:
             self._step_function = make_step(config, self.model, self.compile_mode, self.diagnostics)
             self._step_config = config

@@ -180,9 +180,9 @@ class Assessment(Sequence[Row]):
     @property
     def words(self) -> str:
         """What the cells of the table are."""
-        first = self.rows[0]
+        count = self.rows[0]["episodes"]
         text = (
-            f"Median return of {first['episodes']} episodes [lowest, highest]"
+            f"Median return of {count} episode{'s' * (count != 1)} [lowest, highest]"
             + ", median number of steps" * (len({row["steps_median"] for row in self.rows}) > 1)
             + "."
         )

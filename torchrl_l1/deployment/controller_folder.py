@@ -169,7 +169,8 @@ def _refuse_code(where: object, names: Iterable[object], data: Sequence[str] = (
     for name in map(str, names):
         if ":" in name and name.partition(":")[0] not in data:
             raise ValueError(
-                f"{where} names {name!r}, which would be run: say --trust if the folder is yours"
+                f"{where} names {name!r}, which would be run: say --trust, in Python trusted=True, "
+                "if the folder is yours"
             )
 
 

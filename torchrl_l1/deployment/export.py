@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from torch.fx.experimental.symbolic_shapes import GuardOnDataDependentSymNode
 from torchrl.envs import CatTensors, Compose, DTypeCastTransform, EnvBase, Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules.utils import get_primers_from_module
 
 from torchrl_l1.atomic import write_atomically
 from torchrl_l1.checks import check_choice, check_count
@@ -172,22 +173,30 @@ def export(
 
     Raises:
         OSError: if the file cannot be written there.
-        ValueError: for another format, a file that the policy comes from, a policy that is not
-            made of torch's operations, or a difference above the tolerance, or above a hundredth at
-            observations around the recorded ones, as of a policy that decides by values in Python.
+        ValueError: for another format, a file that the policy comes from, a policy that has a
+            memory or is not made of torch's operations, or a difference above the tolerance, or
+            above a hundredth at observations around the recorded ones, as of a policy that decides
+            by values in Python.
 
     Warns:
         UserWarning: if a trace was made of a policy that looks at values in Python, or the
             environment has transforms of the observation or the action.
     """
     file = Path(file)
-    format = FORMATS.get(file.suffix, "") if format is None else format
-    check_choice("format", format or file.suffix, ("torchscript", "onnx", "export"))
+    if format is None and file.suffix not in FORMATS:
+        raise ValueError(f"{file} must end in {', '.join(FORMATS)}, or format say what to write")
+    format = FORMATS[file.suffix] if format is None else format
+    check_choice("format", format, ("torchscript", "onnx", "export"))
     check_count("steps", steps)
     if format == "onnx":
         for name in ("onnx", "onnxscript", "onnxruntime"):
             require(name, "onnx")
     check_spares(robust.origin, file)
+    if with_policy and get_primers_from_module(robust.policy, warn=False) is not None:
+        raise ValueError(
+            "the policy remembers something from step to step, as a planner its plan, and no file "
+            "holds that: export L1 alone (with_policy=False, --without-policy)"
+        )
     make_place(file)
     config, recorded = _recorded(robust, preset, steps, seed)
     steps = len(recorded)  # the episode may end before

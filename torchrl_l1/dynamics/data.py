@@ -17,8 +17,10 @@ from torch import Tensor
 
 from torchrl_l1.dynamics.episode_ends import (
     check_ends,
+    check_follows,
     check_no_end_within,
     tells_of_ends,
+    tells_what_follows,
     told_ends,
 )
 
@@ -26,6 +28,9 @@ if TYPE_CHECKING:
     from minari import MinariDataset
 
 _Path = str | os.PathLike[str]
+
+# What an array of all that is observed is called, whatever the parts are.
+_ALL_OF_IT = ("observation", "obs", "state")
 
 # Steps of time that differ by more from the usual one are gaps.
 _JITTER = 0.1
@@ -70,7 +75,7 @@ def read_csv(
         ValueError: for a cell that is no number, a line with more cells than there are columns or
             without its episode, if no two lines follow each other, or if a column that is not
             named, such as ``done``, ``is_first``, ``run`` or ``time``, tells of ends between lines
-            that would follow each other.
+            that would follow each other, or one like ``next_angle`` that they do not.
 
     Examples:
         >>> from pathlib import Path
@@ -91,21 +96,30 @@ def read_csv(
     numbers = [*observation, *action, *([] if time is None else [time])]
     wanted = [*numbers, *([] if episode is None else [episode])]
     try:
-        columns = _columns(path, wanted, numbers, delimiter)
+        columns = _columns(path, wanted, numbers, observation, delimiter)
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is no text in UTF-8 ({error.reason}): save it as such") from None
     except csv.Error as error:
         raise ValueError(f"{path} is no table of text: {error}") from None
     told = {
-        name: np.array(cells) for name, cells in columns.items() if cells and name not in wanted
+        name: np.array(cells)
+        for name, cells in columns.items()
+        if cells and name not in wanted and tells_of_ends(name)
     }
-    x, u = (
-        torch.tensor([columns[name] for name in names], dtype=torch.float64).T
-        for names in (observation, action)
-    )
-    clock = None if time is None else torch.tensor(columns[time], dtype=torch.float64)
+
+    def side_by_side(*names: str) -> Tensor:
+        return torch.tensor([columns[name] for name in names], dtype=torch.float64).T
+
+    following = {
+        other: (side_by_side(name), side_by_side(other))
+        for name in observation
+        for other in columns
+        if other not in wanted and tells_what_follows(other, name)
+    }
+    clock = None if time is None else side_by_side(time)[:, 0]
     labels = None if episode is None else np.array(columns[episode])
-    return _rows(str(path), x, u, labels, clock, told)
+    x, u = side_by_side(*observation), side_by_side(*action)
+    return _rows(str(path), x, u, labels, clock, told, following)
 
 
 def read_npz(
@@ -143,7 +157,15 @@ def read_npz(
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such file") from None
     except Exception as error:
-        raise ValueError(f"{path} is no readable .npz file: {error}") from None
+        why: object = error
+        if "Object arrays" in str(error):
+            why = (
+                "it has arrays of objects, which are pickles: save arrays of numbers, episodes one "
+                "after the other, and an array that numbers them"
+            )
+        elif "pickle" in str(error):  # what NumPy takes all else for
+            why = "numpy.savez did not write it"
+        raise ValueError(f"{path} is no readable .npz file: {why}") from None
 
     def array(name: str) -> np.ndarray:
         if name not in arrays:
@@ -174,6 +196,16 @@ def read_npz(
         if tells_of_ends(key) and key not in names
         if values.ndim and values.size and values.dtype.kind in "fiubU"
     }
+    following = {
+        key: (now, side_by_side(key))
+        for name, now in (
+            *((name, x) for name in _ALL_OF_IT),
+            *((name, side_by_side(name)) for name in _listed(observation)),
+        )
+        for key in arrays
+        if key not in names and tells_what_follows(key, name)
+        if arrays[key].size * len(now) == now.numel() * len(arrays[key])
+    }
     if len(x) == len(u) + 1:
         u = torch.cat([u, u.new_zeros(1, u.shape[-1])])
     clock = None if time is None else side_by_side(time)
@@ -184,7 +216,7 @@ def read_npz(
     for name, values in (("action", u), (time, clock), (episode, labels)):
         if values is not None and len(values) != len(x):
             raise ValueError(f"{path}: {name} has {len(values)} rows, the observation {len(x)}")
-    return _rows(str(path), x, u, labels, clock, told)
+    return _rows(str(path), x, u, labels, clock, told, following)
 
 
 def read_minari(dataset: str | MinariDataset, download: bool = False) -> TensorDict:
@@ -237,14 +269,18 @@ def read_minari(dataset: str | MinariDataset, download: bool = False) -> TensorD
 
 
 def _columns(
-    path: _Path, wanted: Sequence[str], numbers: Sequence[str], delimiter: str
+    path: _Path,
+    wanted: Sequence[str],
+    numbers: Sequence[str],
+    observation: Sequence[str],
+    delimiter: str,
 ) -> dict[str, list[Any]]:
     """Columns of a table by name; those of ``numbers`` as numbers, empty cells as NaN.
 
-    Those too that tell the ends of episodes.
+    Those too that tell the ends of episodes, and what followed an observation.
     """
     if not Path(path).is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+        raise FileNotFoundError(f"{path}: no such file{', but a folder' * Path(path).is_dir()}")
     if len(delimiter) != 1:
         raise ValueError(f"{path}: the delimiter is one character, like '\\t', got {delimiter!r}")
     # A byte order mark is none of the first column's name.
@@ -252,17 +288,27 @@ def _columns(
         # Spaces after a delimiter keep quotes from being seen, and are themselves delimiters.
         lines = csv.reader(file, delimiter=delimiter, skipinitialspace=True)
         header = [name.strip() for name in next(filter(None, lines), [])]
+        if any("\0" in name for name in header):
+            raise ValueError(f"{path} is no text: save the table as CSV")
         if header:
             header[0] = header[0].removeprefix("#").strip()
         for name in wanted:
             if name not in header:
                 there = ", ".join(header) or "no first line"
                 hint = "" if len(header) > 1 else f", cells taken to be apart by {delimiter!r}"
+                other = next((mark for mark in (";", "\t", ",") if hint and mark in there), None)
+                hint += f"; give delimiter={other!r}" if other else ""
                 raise KeyError(f"{path} has no column {name!r}, only {there}{hint}")
             if header.count(name) > 1:
                 raise ValueError(f"{path} has {header.count(name)} columns {name!r}: rename them")
-        extra = [name for name in header if tells_of_ends(name) and name not in wanted]
-        places = {name: header.index(name) for name in [*wanted, *extra]}
+        ends = [name for name in header if tells_of_ends(name) and name not in wanted]
+        following = [
+            name
+            for name in header
+            if name not in wanted and any(tells_what_follows(name, one) for one in observation)
+        ]
+        numbers = [*numbers, *following]
+        places = {name: header.index(name) for name in [*wanted, *ends, *following]}
         columns: dict[str, list[Any]] = {name: [] for name in places}
         for line in lines:
             if not any(cell.strip() for cell in line):
@@ -278,11 +324,11 @@ def _columns(
                     try:
                         columns[name].append(_number(cell))
                     except ValueError:
-                        remedy = (
-                            "decimals stand behind a point"
-                            if re.fullmatch(r"[-+]?\d*,\d+", cell)
-                            else "where there is no value, the cell is empty"
-                        )
+                        remedy = "where there is no value, the cell is empty"
+                        if re.fullmatch(r"[-+]?\d*,\d+", cell):
+                            remedy = "decimals stand behind a point"
+                        elif re.search(r"\d:\d", cell):
+                            remedy = "a time is a number of seconds"
                         raise ValueError(
                             f"{path}, line {lines.line_num}, column {name!r}: {cell!r} is no "
                             f"number; {remedy}"
@@ -320,6 +366,7 @@ def _rows(
     labels: np.ndarray | None,
     clock: Tensor | None,
     told: Mapping[str, np.ndarray],
+    following: Mapping[str, tuple[Tensor, Tensor]],
 ) -> TensorDict:
     """Transitions between rows that follow each other."""
     ends = told_ends(told, len(x), labels is not None)
@@ -353,6 +400,10 @@ def _rows(
         ended = torch.zeros(len(x), dtype=torch.bool)
         ended[: len(flags)] = torch.from_numpy(flags[: len(x)])
         check_no_end_within(path, name, ended[order], joined)
+    for name, (now, then) in following.items():
+        after = torch.full_like(now, torch.nan)
+        after[: len(then)] = then[: len(now)]
+        check_follows(path, name, now[order], after[order], joined)
     if not joined.any():
         raise ValueError(f"{path} has {len(x)} rows, of which none follows another in its episode")
     trajectory = torch.cat([torch.zeros(1, dtype=torch.long), (~joined).cumsum(0)])

@@ -1,4 +1,4 @@
-"""What columns of a file that nobody named tell of episodes that end within it."""
+"""What columns of a file that nobody named tell of where its rows do not follow each other."""
 
 from __future__ import annotations
 
@@ -19,6 +19,9 @@ _TIMES = re.compile(r"time(stamp)?s?")
 
 _FALSE = ("", "false", "f", "no", "n", "none")
 
+# Observations that differ by less than this share of their spread are one, rounded twice.
+_ROUNDING = 1e-5
+
 # A step of time that is so many times the usual one is no jitter.
 _GAP = 10
 
@@ -27,6 +30,18 @@ def tells_of_ends(name: str) -> bool:
     """Whether a column of this name tells where episodes end."""
     kinds = (_ENDS, _STARTS, _NUMBERS, _TIMES)
     return any(kind.fullmatch(name.lower()) for kind in kinds)
+
+
+def tells_what_follows(name: str, observation: str) -> bool:
+    """Whether a column of this name holds what an observation was one step later.
+
+    Examples:
+        >>> tells_what_follows("next_observations", "observation"), tells_what_follows("x", "x")
+        (True, False)
+    """
+    one = re.escape(observation.lower())
+    one += "?" if one.endswith("s") else "s?"
+    return bool(re.fullmatch(rf"next[_./ ]?{one}|{one}[_./ ]next", name.lower()))
 
 
 def told_ends(
@@ -104,4 +119,29 @@ def check_no_end_within(path: str, name: str, ends: Tensor, joined: Tensor) -> N
             "episodes, and steps across them would be taken for the plant's: name what numbers "
             "all episodes as episode, such as the running count of their starts; leave out rows "
             "behind an end; or rename the column if it is of something else"
+        )
+
+
+def check_follows(path: str, name: str, now: Tensor, told: Tensor, joined: Tensor) -> None:
+    """Refuse a file that tells of rows that are not what followed the row before.
+
+    Args:
+        path: of the file.
+        name: of the column that tells.
+        now: the observation ``(T, k)``.
+        told: what the file says that it was one step later, ``(T, k)``.
+        joined: whether a row is taken for what followed the one before, ``(T - 1,)``.
+
+    Raises:
+        ValueError: if it is another in any row; values that are no numbers tell nothing.
+    """
+    spread = (now - now.nanmean(0)).square().nanmean(0).sqrt()
+    apart = (now[1:] - told[:-1]).abs() > _ROUNDING * (spread + now[1:].abs())
+    count = int((apart.any(-1) & joined).sum())
+    if count:
+        raise ValueError(
+            f"{path} has {name!r}, which is not what stands in the next row {count} times of "
+            f"{int(joined.sum())}: rows that do not follow each other are no steps of the plant; "
+            "name what numbers the episodes as episode, or, of rows in any order, make a "
+            "tensordict of observation, action and ('next', 'observation') and hand that over"
         )

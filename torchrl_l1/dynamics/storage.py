@@ -64,7 +64,8 @@ def load_dynamics(path: str | os.PathLike[str], device: torch.device | str = "cp
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
         raise ValueError(
-            f"{path} is damaged, or no file of EnsembleDynamics.save: {_line(error)}"
+            f"{path} is damaged, or no file of EnsembleDynamics.save ({_line(error)}); the model "
+            "of a run is torchrl_l1.deployment.load_target(RUN_DIR).model"
         ) from None
     if metadata.get("format") != _FORMAT:
         raise ValueError(f"{path} holds tensors, but EnsembleDynamics.save did not write it")

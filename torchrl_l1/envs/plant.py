@@ -146,9 +146,10 @@ def survives_resets(name: str) -> bool:
 
 def cannot_change(environment: str, name: str) -> str:
     """What to say of a change of the plant that an environment of elsewhere cannot be given."""
+    others = "" if name == _WIND else " or one of Gymnasium's MuJoCo environments"
     return (
-        f"{name} changes the plant, which needs a task of ours or one of Gymnasium's MuJoCo "
-        f"environments{' and no wind' * (name == _WIND)}, not {environment}: leave it out"
+        f"{name} changes the plant, which needs a task of ours{others}, not {environment}: leave "
+        "it out"
     )
 
 

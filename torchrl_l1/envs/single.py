@@ -143,7 +143,8 @@ class SingleGymnasiumEnv(_Single):
                 raise ValueError(
                     f"{name} has {'images or tables' if images else space} as observations; a "
                     "vector of floating-point numbers is needed, which "
-                    f"gymnasium.wrappers.DtypeObservation makes of whole numbers ({PAGE})"
+                    "gymnasium.wrappers.FlattenObservation makes of tables and DtypeObservation of "
+                    f"whole numbers ({PAGE})"
                 )
             return int(space.shape[0])
         parts = {key: part for key, part in space.spaces.items() if _is_vector(part)}

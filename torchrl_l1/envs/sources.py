@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -243,6 +244,13 @@ def _of_function(name: str, found: Any) -> EnvironmentSource:
 
 def _made(function: Callable[[], Any], name: str = "the function") -> EnvBase:
     """What a function makes, as an environment of TorchRL."""
+    try:
+        inspect.signature(function).bind()
+    except TypeError as error:
+        raise ValueError(
+            f"{name} cannot be called without arguments ({error}): give a function that can, which "
+            "hands them on"
+        ) from None
     made = function()
     if isinstance(made, gymnasium.Env):
         try:

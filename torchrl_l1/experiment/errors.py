@@ -107,6 +107,8 @@ def typed_override(key: str, value: str) -> str:
 
 def _of_override(text: str, override: str) -> str:
     """Hydra's words with the override that they are of, and without a link to its grammar."""
+    if "=" not in override:
+        return f"{override!r} is no override: write KEY=VALUE, such as seed=3"
     text = re.split(r"\s*See https://hydra", text)[0]
     where = "" if override in text else f"{override}: "
     key, _, value = override.partition("=")
@@ -130,5 +132,6 @@ def _of_hydra(text: str, cause: str) -> str:
         for line in lines
         if line and not line.startswith(("To append", "full_key: ", "object_type="))
     ]
+    kept += ["(write it as a list, [a,b])"] if "is not a ListConfig" in f"{text}{cause}" else []
     where = f"{place[1]}: " if place and place[1] not in " ".join([*kept, cause]) else ""
     return where + " ".join([*kept, cause])

@@ -41,6 +41,7 @@ from torchrl_l1.experiment.files import digest, read_text
 from torchrl_l1.experiment.l1_options import (
     UNTUNED,
     closest_option,
+    is_tuned,
     l1_option,
     same_controller,
 )
@@ -352,13 +353,15 @@ def _tested_l1(own: L1Settings, task: AnyTask, cell: Condition) -> L1Settings:
     """The controller of a test.
 
     Where the option is the one that the run was trained with, however it was tuned, it is the
-    run's own. Any other is as shipped, with the run's epsilon. What the condition sets counts
-    for either.
+    run's own. Any other is as shipped, with the run's epsilon if it has one. What the condition
+    sets counts for either.
     """
     if cell.l1 == closest_option(own, task):
         settings = own
     else:
-        settings = replace(l1_option(cell.l1), epsilon=own.epsilon)
+        settings = l1_option(cell.l1)
+        if is_tuned(cell.l1):
+            settings = replace(settings, epsilon=own.epsilon)
     tuned: dict[str, Any] = {k: v for k, v in cell.tuning.items() if v is not None}
     if "alpha" in tuned:
         tuned["cutoff"] = None  # two ways to give one number

@@ -87,6 +87,9 @@ class L1Settings:
 # Of L1Settings, what is no setting of L1Config.
 _BESIDE_L1_CONFIG = ("enabled", "compile")
 
+# A time step, s, that is not too long for any rate.
+_SHORT_STEP = 1e-12
+
 
 @dataclass
 class WandbSettings:
@@ -316,12 +319,17 @@ def l1_config(settings: L1Settings, task: str | AnyTask) -> L1Config | None:
     """The controller that a recipe asks for on a task; ``None`` if it is off.
 
     Raises:
-        ValueError: for settings that contradict each other, see :class:`L1Config`.
+        ValueError: for settings that contradict each other, see :class:`L1Config`. Of those of a
+            controller that is off, what would at any time step.
     """
+    own = {name: value for name, value in vars(settings).items() if name not in _BESIDE_L1_CONFIG}
     if not settings.enabled:
+        # Which filter would be turned on nobody knows: what is another's contradicts nothing.
+        of_kalman = {name: own.pop(name) for name in ("process_noise", "inflation")}
+        L1Config(_SHORT_STEP, **own)
+        L1Config.robust(_SHORT_STEP, **of_kalman)
         return None
     task = get_task(task)
-    own = {name: value for name, value in vars(settings).items() if name not in _BESIDE_L1_CONFIG}
     return L1Config(task.dt, **own, action_low=task.action_low, action_high=task.action_high)
 
 

@@ -99,6 +99,8 @@ def trial(recipe: RunSettings, steps: int = STEPS) -> Iterator[Finding]:
     length = min(horizon, max(1, steps // count))
     data = _random(algorithm, count, length, recipe.seed)
     yield from _about_data(task, data, horizon)
+    if not len(_flat(data)):
+        return  # as the first finding about the data says
     seeded = _about_seeds(algorithm, data, count, length, recipe.seed)
     yield seeded
     if not seeded.fix:  # else it cannot be told
