@@ -446,3 +446,24 @@ def test_robustness_page_quotes_the_rules_by_which_it_acts() -> None:
     )
     words = "costs {0} and {2} % of the return with noisy observations, {1} and {3} % on the worst"
     assert words.format(*every, *less) in text
+
+
+def test_the_pendulum_over_the_papers_length_is_quoted() -> None:
+    sampled: dict[str, list[float]] = {"": [], "_unclamped": []}
+    mean: list[float] = []
+    runs: dict[str, set[tuple[str, str]]] = {name: set() for name in sampled}
+    with (RESULTS / "pendulum_long/learning_curves.csv").open(newline="") as handle:
+        for row in csv.DictReader(handle):
+            if int(row["real_steps"]) > 30_000:
+                name = row["task"].removeprefix("inverted_pendulum")
+                sampled[name].append(float(row["return"]))
+                runs[name].add((row["l1"], row["seed"]))
+                mean += [float(row["return_deterministic"])] * (name != "")
+    text = " ".join((ROOT / "docs/studies/table1.md").read_text().split())
+    clipped, unclipped = sampled.values()
+    assert [len(found) for found in runs.values()] == [6, 2]
+    assert f"any iteration is {min(clipped):.2f} in the six runs" in text
+    fallen = sum(value < -10 for value in unclipped)
+    words = f"it is {min(unclipped):.0f} in two runs, and {fallen} of their"
+    assert f"{words} {len(unclipped)} iterations are below -10" in text
+    assert f"iterations, {min(mean):.3f} at worst" in text
