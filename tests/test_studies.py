@@ -467,3 +467,12 @@ def test_the_pendulum_over_the_papers_length_is_quoted() -> None:
     words = f"it is {min(unclipped):.0f} in two runs, and {fallen} of their"
     assert f"{words} {len(unclipped)} iterations are below -10" in text
     assert f"iterations, {min(mean):.3f} at worst" in text
+
+
+def test_the_authors_returns_after_as_many_steps_are_quoted() -> None:
+    none, action = (second_edition("inverted_pendulum", noise) for noise in ("none", "action"))
+    cells = (none["off"], none["paper"], action["off"])
+    off, on, noisy = (float(row["authors_then_mean"]) for row in cells)
+    index, table1 = ((ROOT / f"docs/studies/{page}.md").read_text() for page in ("index", "table1"))
+    assert f"the authors' logs say {off:.1f} and {noisy:.0f}" in index
+    assert f"the authors' logs are at {off:.1f} without L1 and {on:.1f} with it" in table1
