@@ -316,7 +316,7 @@ def test_list_shows_states_and_does_nothing(
 
 def test_sweep_of_a_launcher_fills_the_same_directories(campaign_file: Path) -> None:
     output = campaign_file.parent / "it's a = study"
-    edit(campaign_file, matrix={"noise": ["none"], "l1": ["off"], "l1.alpha": [1e-3, 0.1]})
+    edit(campaign_file, matrix={"noise": ["none"], "l1": ["off"], "trpo.damping": [1e-3, 0.1]})
     campaign = read_campaign(str(campaign_file), ["outer_iterations=1"])
     main(sweep(campaign.runs[0], output, "basic"))
     # Planning compares the configuration of each directory with its own.

@@ -442,7 +442,7 @@ def test_the_primer_of_other_settings_is_told() -> None:
     [
         (
             lambda: L1Transform(model, 0.05),
-            r"L1Transform takes an L1Config .* got 0\.05: .* dt=0\.05",
+            r"L1Transform takes an L1Config .* got float: .* dt=0\.05",
         ),
         (lambda: controller(config={"dt": 0.05}, dt=None), "L1Controller takes an L1Config"),
         (
