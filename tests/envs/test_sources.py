@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from functools import partial
+
 import gymnasium
 import numpy as np
 import pytest
@@ -135,3 +137,13 @@ def test_spaces_that_torchrl_cannot_wrap_are_named():
 
     with pytest.raises(ValueError, match=r"returns a Mixed, which TorchRL cannot .* Tuple\(Box"):
         environment_source(Mixed).one()
+
+
+class Holder:
+    made = property(lambda self: GymEnv("Pendulum-v1"))
+
+
+def test_a_function_that_does_not_tell_its_arguments_makes_environments() -> None:
+    # Python has no signature of getattr.
+    env = environment_source(partial(getattr, Holder(), "made")).one()
+    assert env.reset()["observation"].shape[-1] == 3

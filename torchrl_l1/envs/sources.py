@@ -246,6 +246,8 @@ def _made(function: Callable[[], Any], name: str = "the function") -> EnvBase:
     """What a function makes, as an environment of TorchRL."""
     try:
         inspect.signature(function).bind()
+    except ValueError:  # functions of C need not tell their arguments
+        pass
     except TypeError as error:
         raise ValueError(
             f"{name} cannot be called without arguments ({error}): give a function that can, which "
