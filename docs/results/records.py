@@ -36,7 +36,7 @@ HERE = Path(__file__).parent
 RECORDS = "records.tar.xz"
 DESCRIPTION = "campaign.yaml"
 CAMPAIGNS = Path("runs/campaigns")
-CURVES = "l1_metrpo_curves.csv"
+CURVES = Path("docs/results/l1_metrpo_curves.csv.xz")
 TEXTS = ("config.yaml", "versions.json", "metrics.csv", "timing.csv", "diverged.txt")
 USAGE = "usage: records.py [NAME ...] | records.py pack NAME FOLDER ..."
 
@@ -151,8 +151,9 @@ def report(name: str) -> None:
     with tempfile.TemporaryDirectory() as place, chdir(place):
         campaign = CAMPAIGNS / name
         unpack(name, campaign)
-        Path(CURVES).write_bytes(lzma.decompress((HERE / f"{CURVES}.xz").read_bytes()))
-        command(["report", str(campaign), "--reference-curves", CURVES])
+        CURVES.parent.mkdir(parents=True)
+        shutil.copy(HERE / CURVES.name, CURVES)
+        command(["report", str(campaign), "--reference-curves", str(CURVES)])
         for file in HERE.joinpath(name).iterdir():
             if file.name != RECORDS:
                 file.unlink()

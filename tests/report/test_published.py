@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import lzma
 import re
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from torchrl_l1.report.statistics import final_return, published_spread
 SHARED = Path(__file__).parents[3] / "shared"
 TABLES = SHARED / "reference" / "paper_tables.csv"
 PAPER = SHARED / "paper.tex"
-REFERENCE = SHARED / "reference" / "l1_metrpo_curves.csv"
+REFERENCE = Path(__file__).parents[2] / "docs/results/l1_metrpo_curves.csv.xz"
 HEADER = ",".join(CURVE_COLUMNS)
 
 TASKS = ("inverted_pendulum", "swimmer", "hopper", "walker", "half_cheetah")
@@ -122,7 +123,6 @@ def write(path: Path, *rows: str) -> Path:
     return path
 
 
-@pytest.mark.skipif(not REFERENCE.exists(), reason="no ../shared/reference/l1_metrpo_curves.csv")
 def test_the_published_rule_reproduces_the_printed_table() -> None:
     curves = ReferenceCurves(REFERENCE)
     checked = 0
@@ -140,7 +140,6 @@ def test_the_published_rule_reproduces_the_printed_table() -> None:
     assert checked == 30
 
 
-@pytest.mark.skipif(not REFERENCE.exists(), reason="no ../shared/reference/l1_metrpo_curves.csv")
 def test_reference_steps_count_all_real_steps() -> None:
     curves = ReferenceCurves(REFERENCE).training("half_cheetah", "none", "off")
     assert curves is not None
@@ -182,6 +181,25 @@ def test_settings_are_understood_and_absent_ones_are_none(tmp_path: Path) -> Non
 def test_unusable_curves_are_refused(tmp_path: Path, rows: list[str], message: str) -> None:
     with pytest.raises(ValueError, match=r"curves\.csv") as error:
         ReferenceCurves(write(tmp_path / "curves.csv", *rows))
+    assert message in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (HEADER.encode(), "cannot read"),
+        (lzma.compress(f"{HEADER}\nL1_ON,Walker,1,0,1,1\n".encode())[:-20], "cannot read"),
+        (lzma.compress(b"\xff"), "cannot read"),
+        (lzma.compress(bytes(200_000_001), preset=0), "holds more than 200000000 bytes"),
+    ],
+    ids=["not compressed", "torn", "no text", "too long"],
+)
+def test_unusable_compressed_curves_are_refused(
+    tmp_path: Path, content: bytes, message: str
+) -> None:
+    (tmp_path / "curves.csv.xz").write_bytes(content)
+    with pytest.raises(ValueError, match=r"curves\.csv\.xz") as error:
+        ReferenceCurves(tmp_path / "curves.csv.xz")
     assert message in str(error.value)
 
 

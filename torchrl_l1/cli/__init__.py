@@ -229,7 +229,9 @@ def _report_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]
     add = report.add_argument
     add("dir", nargs="+", help="folders of runs, such as runs/campaigns/NAME")
     add("--output", help="folder of the results; DIR/report by default")
-    add("--reference-curves", metavar="FILE", help="a CSV of the authors' curves to draw behind")
+    add(
+        "--reference-curves", metavar="FILE", help="authors' curves to draw behind, .csv or .csv.xz"
+    )
 
 
 def _recipes(copy: Sequence[str] | None) -> None:

@@ -154,7 +154,7 @@ class ReferenceCurves:
     ``average_return``. Other columns are left alone.
 
     Args:
-        path: the file.
+        path: the file, compressed if its name ends in ``.xz``.
 
     Raises:
         FileNotFoundError: if there is no such file.

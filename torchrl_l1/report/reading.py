@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import lzma
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -291,7 +292,7 @@ def numeric_rows(
     """Some columns of a CSV file.
 
     Args:
-        file: the file.
+        file: the file, compressed if its name ends in ``.xz``.
         numbers: columns of finite numbers.
         words: columns of text that must not be empty.
         optional: columns of numbers that may be absent, empty or not finite: NaN then.
@@ -304,7 +305,7 @@ def numeric_rows(
             there are columns, or a cell holds something else; the message names file and line.
     """
     try:
-        reader = csv.reader(io.StringIO(read_text(file, _MOST_BYTES), newline=""), strict=True)
+        reader = csv.reader(io.StringIO(_table_text(file), newline=""), strict=True)
         header = next(reader, [])
         columns = len(header)
         place = {name: index for index, name in enumerate(header)}
@@ -321,7 +322,7 @@ def numeric_rows(
             # As of a comma in place of a decimal point, which moves all behind it.
             if any(row[columns:]):
                 raise ValueError(f"{file}, line {line}: more values than the {columns} columns")
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, EOFError, UnicodeDecodeError, lzma.LZMAError, csv.Error) as error:
         raise ValueError(f"cannot read {file}: {error}") from error
 
     def column(key: str) -> list[str | None]:
@@ -376,3 +377,14 @@ def _value(text: str | None) -> float:
     except ValueError:
         return math.nan
     return value if math.isfinite(value) else math.nan
+
+
+def _table_text(file: Path) -> str:
+    """The text of a table."""
+    if file.suffix != ".xz" or not file.is_file():
+        return read_text(file, _MOST_BYTES)
+    with lzma.open(file) as compressed:
+        content = compressed.read(_MOST_BYTES + 1)
+    if len(content) > _MOST_BYTES:
+        raise ValueError(f"{file} holds more than {_MOST_BYTES} bytes")
+    return content.decode()
