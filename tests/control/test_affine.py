@@ -381,9 +381,9 @@ def test_each_controller_looks_at_the_covariance_that_it_takes():
 @pytest.mark.parametrize(
     ("config", "words"),
     [
-        (ROBUST, ["estimator='weighted' knows no covariance of function"]),
-        (WEIGHTED, ["estimator='weighted' knows no covariance of function"]),
-        (L1Config(0.05, filter="kalman"), ["filter='kalman' knows no covariance of function"]),
+        (ROBUST, ["estimator='weighted' finds no covariance of function"]),
+        (WEIGHTED, ["estimator='weighted' finds no covariance of function"]),
+        (L1Config(0.05, filter="kalman"), ["filter='kalman' finds no covariance of function"]),
         (PAPER, []),
     ],
 )

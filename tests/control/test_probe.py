@@ -229,7 +229,7 @@ def test_what_is_no_prediction_is_named():
             pendulum(model).rollout(2)
     with pytest.raises(ValueError, match=r"returned shape \(2, 1\) for observations"):
         ActionJacobian(lambda x, u: u)(*data(2))
-    with pytest.raises(ValueError, match="predicts what is not finite at the first"):
+    with pytest.raises(ValueError, match="gives a prediction that is not finite at the first"):
         pendulum(lambda x, u: x + u.sum() / 0.0).rollout(2)
 
 

@@ -90,7 +90,9 @@ def test_time_step_of_serial_environments_once_they_run():
 
 def test_an_environment_that_does_not_tell():
     env = TransformedEnv(GymWrapper(Silent()), L1Transform(model))
-    with pytest.raises(ValueError, match=r"L1Transform needs dt, .* the environment does not tell"):
+    with pytest.raises(
+        ValueError, match=r"L1Transform needs dt, .* the environment does not declare"
+    ):
         env.transform._complete()
     env = TransformedEnv(GymWrapper(Silent()), L1Transform(model, dt=0.3))
     env.transform._complete()
