@@ -175,7 +175,7 @@ def warn_of_residuals(dynamics: object, *, is_calibrated: bool) -> None:
 
 
 def is_positive(covariance: Tensor, is_whole: bool = True) -> bool:
-    """Whether covariances ``(..., n, n)`` are positive definite; or just their mean variances > 0."""
+    """Whether covariances ``(..., n, n)`` are positive definite; if not whole, in the mean only."""
     covariance = covariance.to(torch.promote_types(covariance.dtype, torch.float32))
     if not is_whole:
         return bool((covariance.diagonal(dim1=-2, dim2=-1).mean(-1) > 0).all())
