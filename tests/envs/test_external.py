@@ -448,7 +448,7 @@ def test_horizons_that_are_none():
 def test_a_batch_of_one_is_not_asked_for_its_members():
     task = task_of(lambda: SerialEnv(1, lambda: GymWrapper(Cart())), horizon=5, dt=0.1)
     assert not task.has_plant and task.environment(2, seed=0).rollout(3).shape == (2, 3)
-    with pytest.raises(ValueError, match="does not tell how long an episode is"):
+    with pytest.raises(ValueError, match="does not declare how long an episode is"):
         task_of(lambda: SerialEnv(1, lambda: GymWrapper(Cart())), horizon=None, dt=0.1)
 
 

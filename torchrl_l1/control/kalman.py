@@ -38,9 +38,10 @@ def time_update(covariance: Tensor, process_noise: Tensor | float) -> Tensor:
 def factor(covariance: Tensor, units: Tensor | None = None) -> Tensor:
     r"""Cholesky factor :math:`L` of a covariance ``(..., m, m)``.
 
-    covariance: positive definite up to rounding.
+    Args:
+        covariance: positive definite up to rounding.
         units: the unit of each entry ``(m,)``, where their sizes differ: the small entries would
-        otherwise lose their digits beside the large ones.
+            otherwise lose their digits beside the large ones.
     """
     if units is None:
         return torch.linalg.cholesky_ex(_bolstered(covariance))[0]

@@ -258,7 +258,7 @@ class L1Transform(Transform):
         )
         if self.check and not torch.compiler.is_compiling():
             self._check_repeated(ahead.seal)
-        # What is at hand need not be read again.
+        # Values already at hand need not be read again.
         self._last.ahead = None if torch.compiler.is_compiling() else ahead
         # The caller's tensordict keeps the policy's action: this one is a shallow copy.
         tensordict.set(self.action_key, ahead.executed)

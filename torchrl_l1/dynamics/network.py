@@ -71,7 +71,7 @@ def resolve_precision(
         raise ValueError(f"{name} must be 'auto', 'float32' or 'bfloat16', got {precision!r}")
     if torch.device(device).type != "cpu" or width < _LEAST_WIDTH:
         return "float32"
-    # Only recent versions of torch tell.
+    # Only recent versions of torch report them.
     tell: Callable[[], dict[str, Any]] = getattr(torch.cpu, "get_capabilities", dict)
     capabilities = tell()
     faster = capabilities.get("amx_bf16") or (

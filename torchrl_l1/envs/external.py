@@ -104,7 +104,7 @@ class ExternalTask:
 
     def _told(self, key: str, unit: str, what: str, given: Any, told: Any) -> Any:
         if told is None and given is None:
-            raise ValueError(f"{self.name} does not tell {what}: give {key}={unit} ({PAGE})")
+            raise ValueError(f"{self.name} does not declare {what}: give {key}={unit} ({PAGE})")
         return given if told is None else told
 
     def _single(self, limited: bool = True) -> SingleEnv:

@@ -98,7 +98,7 @@ class _Single:
 
     def __getstate__(self) -> dict[str, Any]:
         if self._made_anew():
-            raise TypeError(self._cannot_be("pickled", "gymnasium.utils.EzPickle makes it anew"))
+            raise TypeError(self._cannot_be("pickled", "gymnasium.utils.EzPickle recreates it"))
         return self.__dict__
 
     def _made_anew(self) -> list[Any]:

@@ -251,7 +251,7 @@ def _made(function: Callable[[], Any], name: str = "the function") -> EnvBase:
     except TypeError as error:
         raise ValueError(
             f"{name} cannot be called without arguments ({error}): give a function that can, which "
-            "hands them on"
+            "passes them on"
         ) from None
     made = function()
     if isinstance(made, gymnasium.Env):

@@ -26,7 +26,7 @@ class TRPOConfig:
         damping: multiple of the identity added to the Fisher matrix.
         cg_iterations: conjugate gradient iterations.
         fisher_fraction: share of the samples on which the Fisher matrix is estimated: 0.1 takes
-            every tenth in the given order, which must have no matching periodicity.
+            every tenth in the given order, which must not repeat with that period.
         backtrack_ratio: factor between successive line search candidates.
         max_backtracks: number of candidates to try.
         accept_ratio: smallest accepted ratio of actual to predicted improvement of the surrogate.

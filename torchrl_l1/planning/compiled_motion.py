@@ -98,7 +98,7 @@ def compiled_predictor(
 # One for each kind of plan: torch keeps eight graphs of a function, then gives up.
 @cache
 def _compiled(kind: tuple[Any, ...], mode: CompileMode) -> Callable[..., Tensor]:
-    notice = "plans go on without compilation, which failed"
+    notice = "plans continue without compilation, which failed"
     # The number of rows is marked as dynamic; all other sizes are fixed for the kind.
     return compiled(cast(FunctionType, _change), mode, dynamic=None, notice=notice)
 

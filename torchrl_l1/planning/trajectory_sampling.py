@@ -233,7 +233,7 @@ def check_sampling(
     discount: float = 1.0,
     compile: bool | str = False,
 ) -> None:
-    """Refuse settings of :func:`evaluate` that make no sense.
+    """Reject settings of :func:`evaluate` that make no sense.
 
     Raises:
         ValueError: naming the setting.
