@@ -125,7 +125,7 @@ class Zeroing(Dropping):
 
 IS_NOT = r"'observation' is not what the environment gave: .* separate out_keys, .*observation_key"
 OVERWRITES = r"comes after L1Transform and overwrites 'observation'.*separate out_keys"
-DISTURBS = r"comes after L1Transform, so that it disturbs.*write Compose\(\.\.\., {}\(\.\.\.\), L1T"
+DISTURBS = r"comes after L1Transform and so disturbs.*write Compose\(\.\.\., {}\(\.\.\.\), L1T"
 LOST = r"\[{}\] under 'l1' are not those that followed from the last step: they were lost"
 
 
@@ -233,7 +233,7 @@ WRONG: dict[str, tuple[Sequence[str], dict[str, Any], type[Exception], str]] = {
             ("transform",),
             {where: [partial(ConditionalPolicySwitch, actor(), lambda data: True)]},
             ValueError,
-            "ConditionalPolicySwitch beside L1Transform lets its policy take steps past it",
+            "ConditionalPolicySwitch beside L1Transform lets its policy bypass it",
         )
         for where in ("before", "after")
     },

@@ -82,7 +82,7 @@ def model(observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
 def test_time_step_of_serial_environments_once_they_run():
     env = SerialEnv(2, partial(skipping, 2))
     augmented = TransformedEnv(env, L1Transform(model))
-    with pytest.raises(ValueError, match="knows dt once an environment is reset"):
+    with pytest.raises(ValueError, match="knows dt only once an environment"):
         augmented.transform.config
     augmented.reset()
     assert augmented.transform.config.dt == pytest.approx(0.1)

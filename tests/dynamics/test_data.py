@@ -60,7 +60,7 @@ def test_a_time_that_goes_back_begins_an_episode(tmp_path: Path) -> None:
 def test_a_gap_is_told_and_not_bridged(tmp_path: Path) -> None:
     lines = [f"{t},{t},0,1" for t in (0.0, 0.1, 0.2, 0.3, 0.5, 0.6, 0.7)]
     file = write(tmp_path / "log.csv", "t,angle,rate,torque", *lines)
-    with pytest.warns(UserWarning, match="1 steps of time are not 0.1 s"):
+    with pytest.warns(UserWarning, match="1 time steps differ from 0.1 s"):
         data = read_csv(file, **KEYS, time="t")
     assert data["dt"][0].item() == pytest.approx(0.1)
     steps = data["next", "observation"][:, 0] - data["observation"][:, 0]
@@ -70,14 +70,14 @@ def test_a_gap_is_told_and_not_bridged(tmp_path: Path) -> None:
 def test_rows_of_one_time_are_a_gap(tmp_path: Path) -> None:
     lines = [f"{t},{t},0,1" for t in (0.0, 0.1, 0.2, 0.2, 0.3, 0.4, 0.5)]
     file = write(tmp_path / "log.csv", "t,angle,rate,torque", *lines)
-    with pytest.warns(UserWarning, match=r"1 steps of time are not 0\.1 s"):
+    with pytest.warns(UserWarning, match=r"1 time steps differ from 0\.1 s"):
         data = read_csv(file, **KEYS, time="t")
     assert len(data) == 5 and data["next", "done"].sum() == 2
     # A table in which every line stands twice would be left without any transition.
     file = write(tmp_path / "log.csv", "t,angle,rate,torque", *(2 * lines[:3]), *(2 * lines[4:]))
     doubled = sorted(file.read_text().splitlines()[1:])
     file = write(tmp_path / "log.csv", "t,angle,rate,torque", *doubled)
-    with pytest.raises(ValueError, match=r"steps of time from 0 to 0\.1 s: resample"):
+    with pytest.raises(ValueError, match=r"time steps from 0 to 0\.1 s: resample"):
         read_csv(file, **KEYS, time="t")
 
 
@@ -161,7 +161,7 @@ def test_columns_padded_with_spaces(tmp_path: Path, delimiter: str, lines: list[
             ["angle,rate,torque,t", *(f"0,0,0,{t}" for t in (0, 1, 3, 4, 9, 11, 17))],
             {"time": "t"},
             ValueError,
-            "steps of time from 1 to 6 s: resample",
+            "time steps from 1 to 6 s: resample",
         ),
         (
             ["angle,rate,torque,t", "0,0,0,5", "0,0,0,5"],

@@ -221,7 +221,7 @@ def test_observations_in_parts_are_chosen_by_name():
         (Box(0, 9, (1,), np.int64), ANY, "as actions"),
         (Box(-np.inf, np.inf, (1,), np.float32), ANY, "unbounded actions"),
         (Box(-3e38, 3e38, (1,), np.float32), ANY, "unbounded actions"),
-        (FORWARD, Box(0, 255, (8, 8, 3), np.uint8), "images.*FlattenObservation makes of tables"),
+        (FORWARD, Box(0, 255, (8, 8, 3), np.uint8), "images.*FlattenObservation makes from tables"),
         (FORWARD, Discrete(4), "as observations"),
         (FORWARD, Dict(camera=Box(0, 255, (8, 8, 3), np.uint8)), "no vectors"),
     ],

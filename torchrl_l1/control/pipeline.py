@@ -98,8 +98,8 @@ def check_resets(owner: str, env: EnvBase) -> None:
     """
     if "_reset" not in env.reset_keys:
         raise ValueError(
-            f"{owner} restarts where a root '_reset' says so, but this environment resets by "
-            f"{env.reset_keys} only: give it a 'done' at its root, for each of its batch"
+            f"{owner} restarts on a root '_reset', but this environment resets by "
+            f"{env.reset_keys} only: give it a 'done' at its root with the shape of its batch"
         )
 
 
@@ -123,8 +123,8 @@ def check_order(
     position = next(index for index, member in enumerate(chain) if member is l1)
     if any(isinstance(member, ConditionalPolicySwitch) for member in chain):
         raise ValueError(
-            f"ConditionalPolicySwitch beside {owner} lets its policy take steps past it: make the "
-            "choice within the policy"
+            f"ConditionalPolicySwitch beside {owner} lets its policy bypass it: make the choice "
+            "within the policy"
         )
     for index, later in enumerate(chain[position + 1 :], position + 1):
         name = type(later).__name__
@@ -140,7 +140,7 @@ def check_order(
         acts_on, *_ = action_keys(chain[position + 1 : index], getattr(later, "key", action_key))
         if disturbs == "action" and acts_on == action_key:
             raise ValueError(
-                f"{name} comes after {owner}, so that it disturbs the policy's action and not what "
+                f"{name} comes after {owner} and so disturbs the policy's action, not what "
                 f"{owner} sends to the actuators: {order}"
             )
         overwrites = observation_key in _written(later) or (
@@ -314,9 +314,9 @@ def warn_of_surroundings(
     ):
         if _is_beyond(given, told, sign):
             warnings.warn(
-                f"{owner} has {name}={given}, but the environment's action ends at {told}: what L1 "
-                "sends beyond that does not arrive, and L1 does not know; leave the bounds out, or "
-                "give infinite ones if the spec is wrong",
+                f"{owner} has {name}={given}, but the environment's action ends at {told}: "
+                "anything L1 sends beyond that is cut off without its knowledge; leave the "
+                "bounds out, or give infinite ones if the spec is wrong",
                 UserWarning,
                 stacklevel=3,
             )

@@ -132,8 +132,8 @@ def probe_covariance(
             )
         if not is_positive(found, is_whole):
             raise ValueError(
-                f"{name} is not finite and positive definite: give states that it never misses a "
-                "small variance"
+                f"{name} is not finite and positive definite: give states without errors a small "
+                "variance"
             )
         if is_late and found.ndim > 2:
             other = covariance_of(1.0 - 2.0 * observation, 1.0 - 2.0 * action)
@@ -157,19 +157,19 @@ def warn_of_residuals(dynamics: object, *, is_calibrated: bool) -> None:
         measured = getattr(residuals, "measured", None)
         if isinstance(measured, Tensor) and not bool(measured):
             warnings.warn(
-                f"nothing has measured the residuals of {describe(dynamics)}, whose covariance is "
-                "taken for the identity: fit_ensemble does, and model.residuals.measure() takes "
-                "those of a training of your own",
+                f"the residuals of {describe(dynamics)} have not been measured, so their "
+                "covariance is taken to be the identity: fit the model with fit_ensemble, or "
+                "call model.residuals.measure() after your own training",
                 stacklevel=2,
             )
         return
     calibrated = getattr(residuals, "calibrated", None)
     if isinstance(calibrated, Tensor) and not bool(calibrated):
         warnings.warn(
-            f"the Kalman filter takes the residuals of {describe(dynamics)} for white noise, since "
-            "nothing has told it how far to trust them: after the fit, call calibrate_filter("
-            "model.residuals, model.value_and_jacobian, data, config) with episodes of at least 20 "
-            "steps, or give inflation",
+            f"the Kalman filter treats the residuals of {describe(dynamics)} as white noise, "
+            "since they are not calibrated: after the fit, call "
+            "calibrate_filter(model.residuals, model.value_and_jacobian, data, config) with "
+            "episodes of at least 20 steps, or give inflation",
             stacklevel=2,
         )
 
@@ -287,7 +287,7 @@ def _check_repeatable(
         )
     if _differ(value, change(observation, action), observation):
         raise ValueError(
-            f"{describe(dynamics)} predicts something else at each call for the same observation "
+            f"{describe(dynamics)} gives another prediction at each call for the same observation "
             "and action: L1 needs the mean, without sampling or dropout (eval mode)"
         )
 
@@ -346,8 +346,8 @@ def _choose_mode(
     if any(_differ(value, change(observation, u), observation) for u in others):
         raise ValueError(
             f"{describe(dynamics)} predicts a change that depends on the action, but its "
-            "derivative by the action is zero: it is detached (detach, no_grad, NumPy) or "
-            "piecewise constant; keep the graph, or give the model a method "
+            "derivative with respect to the action is zero: it is detached (detach, no_grad, "
+            "NumPy) or piecewise constant; keep the graph, or give the model a method "
             "value_and_jacobian(observation, action)"
         )
     warnings.warn(
@@ -381,9 +381,9 @@ def _warn_of_reverse(
 def failure(dynamics: object, observation: Tensor, action: Tensor, error: Exception) -> ValueError:
     """The error to raise if a model cannot be called at all."""
     return ValueError(
-        f"{describe(dynamics)} failed at its first call, with two arguments, an observation of "
-        f"shape {tuple(observation.shape)} and an action of shape {tuple(action.shape)}, both "
-        f"{observation.dtype}, which L1 expects a model to take: {_first_line(error)}"
+        f"{describe(dynamics)} failed at its first call; L1 calls a model with two arguments, an "
+        f"observation of shape {tuple(observation.shape)} and an action of shape "
+        f"{tuple(action.shape)}, both {observation.dtype}: {_first_line(error)}"
     )
 
 

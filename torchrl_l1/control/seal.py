@@ -115,8 +115,8 @@ def verify(
     found = sealed(observation, state)
     if found.shape != seal.shape:
         raise ValueError(
-            f"{owner}: the state under {key!r} is that of an L1 with other settings or widths, of "
-            "another controller's primer: each needs its own, under a key of its own"
+            f"{owner}: the state under {key!r} is that of an L1 with other settings or widths, "
+            "from another controller's primer: give each its own key"
         )
     if not torch.equal(found, seal):
         n = observation.shape[-1]

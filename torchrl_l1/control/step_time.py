@@ -103,5 +103,5 @@ def check_time_step(owner: str, dt: float, env: EnvBase) -> None:
     if told is not None and abs(dt - told) > _TOLERANCE * told:
         raise ValueError(
             f"{owner} has dt={dt:.6g}, but a step of the environment takes {told:.6g} s: leave dt "
-            "out or give that, or check_dt=False if the environment is wrong"
+            "out, give that value, or give check_dt=False if the environment is wrong"
         )

@@ -185,7 +185,8 @@ class L1Transform(Transform):
         """
         if not self._settings.is_complete:
             raise ValueError(
-                "L1Transform knows dt once an environment is reset and declares it: else give dt"
+                "L1Transform knows dt only once an environment that declares it is reset: give "
+                "dt otherwise"
             )
         return self._settings.config
 
@@ -328,7 +329,7 @@ class L1Transform(Transform):
         if lacking:
             raise ValueError(
                 f"a batched environment would lose {lacking} of L1Transform, which a later "
-                f"transform takes from the specs: add {self.key!r} to its SelectTransform"
+                f"transform removes from the specs: add {self.key!r} to its SelectTransform"
             )
 
     def _fresh(self, tensordict_reset: TensorDictBase) -> TensorDictBase:

@@ -437,11 +437,11 @@ def _steps(path: str, clock: Tensor, joined: Tensor) -> tuple[float, Tensor]:
         remedy = "resample to one sampling time"
         if 4 * back > int(onward.sum()):
             remedy = f"the time goes back {back} times, sort the rows by it"
-        raise ValueError(f"{path}: steps of time from {low:.4g} to {high:.4g} s: {remedy}")
+        raise ValueError(f"{path}: time steps from {low:.4g} to {high:.4g} s: {remedy}")
     if gaps:
         warnings.warn(
-            f"{path}: {gaps} steps of time are not {dt:.4g} s to within a tenth: a new episode "
-            "begins after each",
+            f"{path}: {gaps} time steps differ from {dt:.4g} s by more than a tenth: a new "
+            "episode begins after each",
             stacklevel=4,
         )
     return dt, joined & even

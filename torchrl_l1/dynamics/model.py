@@ -370,7 +370,7 @@ class EnsembleDynamics(nn.Module):
         """
         loaded = load_dynamics(path, device)
         if not isinstance(loaded, cls):
-            raise ValueError(f"{path} holds a {type(loaded).__name__}, no {cls.__name__}")
+            raise ValueError(f"{path} holds a {type(loaded).__name__}, not a {cls.__name__}")
         return loaded
 
     def _over_elites(self, per_member: Tensor) -> Tensor:

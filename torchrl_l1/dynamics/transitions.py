@@ -65,9 +65,8 @@ class Transitions:
         action = self.data["action"]
         for entry in (action == action[:1]).all(0).nonzero().squeeze(-1).tolist():
             warnings.warn(
-                f"{_name(action_key)}[{entry}] never varies: what it does is not in the data, and "
-                "the model takes it for nothing, so that L1 leaves it alone; record data that move "
-                "it",
+                f"{_name(action_key)}[{entry}] never varies, so its effect is not in the data: "
+                "the model ignores it and L1 does not use it; record data that vary it",
                 stacklevel=3,
             )
         before, after = self.data["observation"], self.data["next", "observation"]
@@ -99,7 +98,7 @@ class Transitions:
                     continue
                 told.add((name, entry))
                 warnings.warn(
-                    f"{name}[{entry}] {what.format(f'{values[entry]:.2g}')}, next to nothing for a "
+                    f"{name}[{entry}] {what.format(f'{values[entry]:.2g}')}, very little for a "
                     f"model with std_floor={floor:g}: give it in smaller units, or a std_floor of "
                     f"{values[entry] / 10:.0e}",
                     stacklevel=4,
@@ -434,7 +433,7 @@ def _is_transition(rows: TensorDictBase, keys: tuple[NestedKey, NestedKey]) -> T
         warnings.warn(
             f"dropped {int(across.sum())} of {count} transitions at resets: "
             f"{_name(_after(keys[0]))} of an ended episode is the observation that the next one "
-            "starts from, as an environment reports it that resets itself",
+            "starts from, as reported by an environment that resets itself",
             stacklevel=4,
         )
     return finite & ~rows["reset"]

@@ -131,8 +131,8 @@ class EnvironmentTransform(Transform):
             if is_controller and earlier.action_key == key:
                 other = type(earlier).__name__
                 raise ValueError(
-                    f"{mine} comes after {other}, so that it disturbs the policy's action and not "
-                    f"what {other} sends to the actuators: put {mine} before {other}"
+                    f"{mine} comes after {other} and so disturbs the policy's action, not what "
+                    f"{other} sends to the actuators: put {mine} before {other}"
                 )
         for later in chain[place + 1 :]:
             skips = isinstance(later, FrameSkipTransform) and later.frame_skip > 1
@@ -141,7 +141,7 @@ class EnvironmentTransform(Transform):
                 other = type(later).__name__
                 raise ValueError(
                     f"{other} comes after {mine} and steps the environment through copies of what "
-                    f"is before it, which would disturb it in another way: put {other} before "
+                    f"is before it, which would disturb it differently: put {other} before "
                     f"{mine}, or around it, TransformedEnv(env, {other}(...), auto_unwrap=False)"
                 )
 

@@ -80,7 +80,7 @@ def get_task(
         return found if horizon in (None, found.horizon) else replace(found, horizon=horizon)
     if found is task and (dt or horizon or observation_keys):
         raise ValueError(
-            f"dt, horizon and observation_keys go with a name; give them when {name} is made"
+            f"dt, horizon and observation_keys go with a name; give them where {name} is made"
         )
     return found
 

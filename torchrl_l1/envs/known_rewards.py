@@ -120,7 +120,9 @@ def _double_pendulum(env: Any) -> Outcome:
         speed = 1e-3 * first.square() + 5e-3 * second.square()
         return env._healthy_reward * (y > 1).to(y) - distance - speed
 
-    return Outcome(reward, fallen, "angular velocities beyond 10 rad/s are cut in the observation")
+    return Outcome(
+        reward, fallen, "angular velocities beyond 10 rad/s are clipped in the observation"
+    )
 
 
 def _reacher(env: Any) -> Outcome:
@@ -242,9 +244,9 @@ def _ant(env: Any) -> Outcome | None:
         return ~healthy(following)
 
     if not note:
-        note = "the forward speed is that of the torso a substep before"
+        note = "the forward speed is that of the torso one substep earlier"
     if env._contact_cost_weight:
-        note += ", and what the ground is pressed with costs something and is not observed"
+        note += ", and contact forces have a cost but are not observed"
     return Outcome(reward, fallen if env._terminate_when_unhealthy else never, note)
 
 

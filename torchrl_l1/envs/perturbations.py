@@ -277,12 +277,12 @@ class Perturbation:
     )  # fmt: skip
     random_signs_bias: float = disturbance(
         "signs", _signs, neutral=0.0, units="action units", matched=True,
-        help="magnitudes of biases of random signs, action units",
+        help="magnitudes of biases with random signs, action units",
         quick=(0.3,), full=(0.1, 0.3, 0.5),
     )  # fmt: skip
     sine_bias: float = disturbance(
         "sine", SineBias, neutral=0.0, units="action units", matched=True,
-        help="amplitudes of a bias that swings, action units", quick=(0.3,), full=(0.1, 0.3, 0.5),
+        help="amplitudes of a sinusoidal bias, action units", quick=(0.3,), full=(0.1, 0.3, 0.5),
     )  # fmt: skip
     step_bias: float = disturbance(
         "step", StepBias, neutral=0.0, units="action units", matched=True,
@@ -290,7 +290,7 @@ class Perturbation:
     )  # fmt: skip
     random_walk_bias: float = disturbance(
         "walk", WalkBias, neutral=0.0, units="action units", matched=True,
-        help="deviations of a step of a bias that walks at random, action units",
+        help="step deviations of a random-walk bias, action units",
         quick=(0.03,), full=(0.01, 0.03, 0.05),
     )  # fmt: skip
     motor_gain: float = disturbance(
@@ -430,7 +430,9 @@ def disturbance_transforms(**disturbances: Any) -> list[Transform]:
     """
     active = active_disturbances(disturbances)
     if plant := plant_values(active):
-        raise ValueError(f"{', '.join(plant)}: a change of the plant is no transform, see make_env")
+        raise ValueError(
+            f"{', '.join(plant)}: a change of the plant is not a transform, see make_env"
+        )
     actuators, sensors = placed_transforms(active)
     return [*actuators, *sensors]
 

@@ -143,8 +143,8 @@ class SingleGymnasiumEnv(_Single):
                 raise ValueError(
                     f"{name} has {'images or tables' if images else space} as observations; a "
                     "vector of floating-point numbers is needed, which "
-                    "gymnasium.wrappers.FlattenObservation makes of tables and DtypeObservation of "
-                    f"whole numbers ({PAGE})"
+                    "gymnasium.wrappers.FlattenObservation makes from tables and "
+                    f"DtypeObservation from whole numbers ({PAGE})"
                 )
             return int(space.shape[0])
         parts = {key: part for key, part in space.spaces.items() if _is_vector(part)}
@@ -211,7 +211,7 @@ class SingleTorchRLEnv(_Single):
         if tuple(env.batch_size) not in ((), (1,)):
             raise ValueError(
                 f"{name} is a batch of {tuple(env.batch_size)} environments; let it return a "
-                "single one, which is made as often as it is needed"
+                "single one, which is created as often as needed"
             )
         self._name = name
         parts = vectors(env)

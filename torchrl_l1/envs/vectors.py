@@ -177,7 +177,7 @@ def unclear(left_out: Sequence[str], found: Iterable[str]) -> str:
     return (
         f"the observations {', '.join(left_out)} are not vectors of floating-point numbers: say "
         f"which others make the state, such as observation_keys=[{','.join(sorted(found))}], or "
-        "leave them out by gymnasium.wrappers.FilterObservation"
+        "leave them out with gymnasium.wrappers.FilterObservation"
     )
 
 

@@ -37,7 +37,8 @@ class ShootingConfig:
         check_counts(self, "horizon", "candidates", prefix="shooting.")
         if self.warm_start and self.candidates == 1:
             raise ValueError(
-                "shooting.candidates must be at least 2 with a warm start, which is the first"
+                "shooting.candidates must be at least 2 with a warm start, which is the first of "
+                "them"
             )
 
 
