@@ -202,8 +202,9 @@ def replay(
         residual: ``(S, T, n)``, state units.
         jacobian: ``(S, T, n, m)``.
         action: the executed action ``(S, T, m)``.
-        statistics: statistics of the residuals; what differs between candidates has them as its
-            leading dimension. The covariance is ``(n, n)``, or ``(S, T, n, n)`` with one per step.
+        statistics: statistics of the residuals; entries that differ between candidates have a
+            leading dimension of that size. The covariance is ``(n, n)``, or ``(S, T, n, n)`` with
+            one per step.
         candidates: C.
 
     Returns:

@@ -90,11 +90,11 @@ class L1Config:
             needs no ``cutoff``, ``alpha``, ``a_s`` or ``filter_input``. Its input is known before
             the model is expanded, so the operating point moves to the executed input in every step,
             and ``epsilon`` and ``switch_on`` have no effect.
-        covariance: the covariance of the residuals that both use: the one from the model's
-            validation (``"residuals"``), or one of the model at each state and action: from its
+        covariance: covariance of the residuals for both of these: ``"residuals"``, measured on the
+            model's validation data; or one that depends on state and action, from the model's
             ``"heads"``, the ``"disagreement"`` of its members, or the ``"sum"`` of all three.
-        dead_zone: width, in posterior standard deviations of the disturbance, of the zone around
-            zero within which the Kalman filter's estimate is not acted on; 0 acts on all of it.
+        dead_zone: number of posterior standard deviations of the disturbance within which the
+            Kalman filter's estimate is not acted on; 0 acts on all of it.
         process_noise: standard deviation of the disturbance's change per step, as a fraction of
             half the range of the action (of one action unit without bounds, or with a range beyond
             1e9). If ``None``, the model's own value, see :func:`~torchrl_l1.control.calibrate`, or

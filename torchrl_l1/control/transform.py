@@ -106,8 +106,9 @@ class L1Transform(Transform):
             or the observation's for a model without any.
         predicts: what ``dynamics`` predicts, ``"change"`` or ``"next_observation"``; ``None``
             decides as :class:`~torchrl_l1.control.ActionJacobian` does.
-        out_key: key of the prediction, for a model with several output keys, likewise.
-        ensemble_dim: output dimension over which the mean is taken, likewise.
+        out_key: key of the prediction, for a model with several output keys.
+        ensemble_dim: output dimension over which the mean is taken, for a model that returns one
+            prediction per ensemble member.
         check_dt: whether ``dt`` must match that of an environment that declares one.
         check: whether each step checks that the observation and the controller's state are those
             from the previous step; turn it off to edit them on purpose.
