@@ -134,7 +134,7 @@ def estimate(
     :math:`\Lambda` is the inflated covariance of the residuals. The squares of the diagonal
     :math:`D_t` are running means of :func:`~.kalman.noise_ratio`, none below one, times their mean
     over the states: a state whose sensor has become noisy loses weight, and all states do if many
-    have. A single residual beyond expectation loses its weight at once, see :func:`~.kalman.doubt`.
+    have. A single residual beyond expectation loses weight at once, see :func:`~.kalman.doubt`.
 
     Args:
         config: the settings.

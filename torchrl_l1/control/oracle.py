@@ -30,11 +30,10 @@ class OracleTransform(Transform):
     r"""A clairvoyant controller that takes the place of :class:`~torchrl_l1.control.L1Transform`.
 
     It looks up the matched disturbances before it in ``Compose``, or in a transformed environment
-    inside. It sends the input that they turn back into the policy's action, that is, the policy's
-    action minus the matched disturbance, clipped once, at the end, to the actuators' limits. With
-    disturbances
-    :math:`d_1, \dots, d_k` in the order of ``Compose``, an input :math:`u` reaches the plant as
-    :math:`d_1(\dots d_k(u))`, and the oracle sends
+    inside, and sends the input that they turn back into the policy's action: the policy's action
+    minus the matched disturbance, clipped once, at the end, to the actuators' limits. With
+    disturbances :math:`d_1, \dots, d_k` in the order of ``Compose``, an input :math:`u` reaches the
+    plant as :math:`d_1(\dots d_k(u))`, and the oracle sends
 
     .. math:: u = \mathrm{clip}\big(d_k^{-1}(\dots d_1^{-1}(\pi(x)))\big).
 

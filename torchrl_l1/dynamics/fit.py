@@ -42,8 +42,8 @@ class FitConfig:
         final_learning_rate_fraction: the final step size as a fraction of the initial one, reached
             linearly over the gradient steps that a fit may take.
         batch_size: transitions per member and gradient step.
-        max_epochs: most passes over the training data.
-        max_gradient_steps: most gradient steps, whatever the number of epochs.
+        max_epochs: maximum number of passes over the training data.
+        max_gradient_steps: maximum number of gradient steps, whatever the number of epochs.
         patience: epochs without a lower validation loss of any member after which to stop.
         validation_fraction: share of new transitions permanently kept out of training.
         weight_penalty: coefficient of half the squared hidden weights, divided by the number
@@ -52,8 +52,9 @@ class FitConfig:
             biases excepted; none if empty. The authors of PETS state theirs for twice the negative
             log-likelihood, or half the squared error: half of each has the same effect here with a
             Gaussian head, twice with a deterministic one.
-        bootstrap: whether each member trains on its own resample of the training transitions: as
-            many, drawn with replacement and again at each fit. Validation data are shared.
+        bootstrap: whether each member trains on its own resample of the training transitions:
+            equally many, drawn with replacement for each fit. All members share the validation
+            data.
         elites: number of members with the lowest validation loss that become the model's elites
             after the fit; if null, the model's elites stay as they are.
         precision: precision of the products of hidden units and of their gradients, ``float32``,
@@ -175,10 +176,10 @@ def fit_dynamics(
 ) -> EnsembleDynamics:
     """A dynamics model fitted to your own data, with a measure of how good it is.
 
-    Where the data hold 20 steps in a row, the settings that the robust controller takes from the
-    model are found as well, as by :func:`~torchrl_l1.dynamics.calibrate_filter` with the range of
-    the recorded actions as bounds. Call that again if the actuators reach further, or with data
-    free of the disturbances to be cancelled.
+    If the data hold 20 steps in a row, this also finds the settings that the robust controller
+    takes from the model, like :func:`~torchrl_l1.dynamics.calibrate_filter` with the range of the
+    recorded actions as bounds. Call that again if the actuators reach further, or with data free of
+    the disturbances to be cancelled.
 
     Args:
         data: transitions as TorchRL makes them: a replay buffer, a tensordict of any batch size,

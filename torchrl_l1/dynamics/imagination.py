@@ -173,8 +173,8 @@ class EnsembleWorldModel(TensorDictModuleBase):
             call.
         terminated: maps next observations to whether the task ends there ``(...)``; never if
             ``None``.
-        box_exit: how leaving the box around the data counts: ``"fail"``, worth nothing from then
-            on, or ``"truncate"``, cut off where the model ends.
+        box_exit: what leaving the box around the data does: ``"fail"`` terminates the episode,
+            which is worth nothing from then on; ``"truncate"`` truncates it where the model ends.
     """
 
     in_keys = ["observation", "action"]  # noqa: RUF012
@@ -247,7 +247,7 @@ class EnsembleModelEnv(ModelBasedEnvBase):
         batch_size: shape of the batch of environments; ``()`` for planners, which add their own.
         propagation: see :class:`EnsembleWorldModel`, also for the next two.
         terminated: where the task ends.
-        box_exit: how leaving the box counts.
+        box_exit: what leaving the box does.
 
     Raises:
         ValueError: for bounds that are empty, not finite or of the wrong width, or an unknown

@@ -90,7 +90,7 @@ class RewardModel(OutcomeModel):
     The networks see the observation, the action and the change of the observation, each entry
     normalised on its own. The reward is the mean over the members, limited to the range of the
     data's rewards widened by ``margin``: outside, a regression knows nothing, and a policy would
-    find where it promises most.
+    exploit its errors.
 
     Args:
         observation_dim: number of observations, n.
@@ -269,7 +269,8 @@ def fit_termination(
 ) -> TerminationReport:
     """Fit a model to the terminations of episodes, starting from its current weights.
 
-    An end by the clock, ``truncated``, is not a property of the state and must not be among them.
+    An end by the clock, ``truncated``, is not a property of the state and must not count as a
+    termination.
 
     Args:
         model: the model, changed in place; if no transition of ``train`` ends an episode, it only
