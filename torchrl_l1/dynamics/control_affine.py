@@ -23,7 +23,7 @@ class ControlAffineDynamics(EnsembleDynamics):
     :class:`EnsembleDynamics`: arguments, normalisers, data box, members, fit. The Jacobian is the
     ensemble's mean gain whatever the action, so the switching law never triggers.
 
-    ``hidden`` is taken as it is; :func:`~torchrl_l1.dynamics.make_dynamics` matches the number
+    ``hidden`` is used as it is; :func:`~torchrl_l1.dynamics.make_dynamics` matches the number
     of parameters to that of an :class:`EnsembleDynamics`.
 
     Examples:
