@@ -114,7 +114,7 @@ def read_transitions(
     dtype: torch.dtype | None = None,
     device: torch.device | None = None,
 ) -> Transitions:
-    """Read transitions of a tensordict or buffer, without other rows, and split off validation data.
+    """Read transitions of a tensordict or buffer, drop other rows, and split off validation data.
 
     Two rows belong to one trajectory if the second starts with the observation with which the first
     ended, no flag says that an episode ended between them, and their ``traj_ids``, if any, are
