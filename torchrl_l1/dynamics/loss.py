@@ -91,8 +91,8 @@ class EnsembleDynamicsLoss(LossModule):
         members, batch = model.members, tuple(observation.shape[:-1])
         if not (len(batch) == 1 or (len(batch) == 2 and batch[0] == members)):
             raise ValueError(
-                f"EnsembleDynamicsLoss: data of batch size {batch} must have [B] for all members, "
-                f"or [{members}, B] for each its own: reshape them with reshape(-1)"
+                f"EnsembleDynamicsLoss: data have batch size {batch}, expected [B] for all "
+                f"members or [{members}, B] with a batch for each: reshape them with reshape(-1)"
             )
         expected = model.change_normalizer.mean.dtype
         for key, value in zip(self.in_keys, (observation, action, next_observation), strict=True):
