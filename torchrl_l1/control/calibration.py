@@ -250,5 +250,6 @@ def _before(
         started=torch.ones_like(state.started),
         covariance=posterior.covariance.flatten(-2),
         noise=estimated.noise,
+        skill=estimated.skill,
         jacobian=jacobian.flatten(-2).expand(*state.started.shape[:-1], -1),
     )

@@ -21,7 +21,7 @@ Scalars = float | tuple[float, ...]
 
 _NUMBERS = (
     *("dt", "epsilon", "cutoff", "alpha", "dead_zone", "process_noise", "inflation"),
-    *("initial_deviation", "forgetting"),
+    *("initial_deviation", "forgetting", "skill_forgetting"),
 )
 
 DEFAULT_ALPHA = 0.35
@@ -105,6 +105,9 @@ class L1Config:
             ``process_noise``.
         forgetting: decay factor per step of the running estimate of each state's noise level, which
             detects a sensor that has become noisy; 1 turns it off.
+        skill_forgetting: decay factor per step of the record of how much the Kalman filter's
+            forecasts of the residual have gained, of what they promised: the input is scaled by
+            that share, see :func:`~torchrl_l1.control.kalman.skill`. 1 turns it off.
         max_error: largest entry of the prediction error that is believed, in raw state units; may
             be infinite. Beyond it an observation counts as not finite: L1 stands aside and
             restarts.
@@ -141,6 +144,7 @@ class L1Config:
     inflation: float | None = None
     initial_deviation: float = 0.3
     forgetting: float = 0.97
+    skill_forgetting: float = 1.0
     max_error: float = 1e8
 
     def __post_init__(self) -> None:
@@ -191,8 +195,9 @@ class L1Config:
                 raise ValueError(f"{name} must not exceed 1e9, got {getattr(self, name)}")
         if self.initial_deviation <= 0:
             raise ValueError(f"initial_deviation must be positive, got {self.initial_deviation}")
-        if not 0 < self.forgetting <= 1:
-            raise ValueError(f"forgetting must lie in (0, 1], got {self.forgetting}")
+        for name in ("forgetting", "skill_forgetting"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"{name} must lie in (0, 1], got {getattr(self, name)}")
         if not self.needs_calibration:
             if self.process_noise is not None or self.inflation is not None:
                 raise ValueError(
@@ -266,7 +271,11 @@ class L1Config:
         probabilistic models. Inflation and process noise are the model's own, found by
         :func:`~torchrl_l1.control.calibrate` where there are undisturbed episodes.
         """
-        robust: dict[str, Any] = {"estimator": "weighted", "filter": "kalman"}
+        robust: dict[str, Any] = {
+            "estimator": "weighted",
+            "filter": "kalman",
+            "skill_forgetting": 0.99,
+        }
         return cls(dt, **(robust | settings))
 
     @property

@@ -8,6 +8,10 @@ import torch
 from torch import Tensor
 
 
+TRUST = 10.0
+"""Gain and promise of forecasts before any: so many squares of one standard deviation."""
+
+
 class Posterior(NamedTuple):
     """What is known of the matched disturbance.
 
@@ -160,6 +164,43 @@ def significant(posterior: Posterior, dead_zone: float) -> Tensor:
     variance = posterior.covariance.diagonal(dim1=-2, dim2=-1)
     square = posterior.mean.square().clamp_min(torch.finfo(variance.dtype).tiny)
     return posterior.mean * (1 - dead_zone**2 * variance / square).clamp_min(0)
+
+
+def record_forecast(sums: Tensor, forecast: Tensor, innovation: Tensor, forgetting: float) -> Tensor:
+    r"""Sums over past steps of what forecasts of the residual have gained and promised.
+
+    A forecast :math:`f` of a residual :math:`r` takes :math:`|r|^2 - |r - f|^2` off its square.
+    Where it is right but for noise that is :math:`|f|^2` in the mean.
+
+    Args:
+        sums: of the gains and of the promises before ``(..., 2)``.
+        forecast: whitened effect of the disturbance that was expected ``(..., n)``.
+        innovation: whitened :math:`r - f` ``(..., n)``.
+        forgetting: factor on the sums before.
+
+    Returns:
+        the sums with this step ``(..., 2)``.
+    """
+    gained = (forecast * (2 * innovation + forecast)).sum(-1)
+    promised = forecast.square().sum(-1)
+    return forgetting * sums + torch.stack([gained, promised], -1)
+
+
+def skill(sums: Tensor) -> Tensor:
+    """Share of what forecasts promised that they have gained, from 0 to 1: ``(..., 1)``.
+
+    An estimate that comes too late for what it follows, as of a delay, forecasts no better than
+    nothing does. Without a record it is trusted: :data:`TRUST` counts as gained and promised.
+
+    Args:
+        sums: of :func:`record_forecast`.
+
+    Examples:
+        >>> skill(torch.tensor([0.0, 0.0])), skill(torch.tensor([-5.0, 100.0]))
+        (tensor([1.]), tensor([0.0455]))
+    """
+    gained, promised = (sums + TRUST).split(1, -1)
+    return (gained / promised).clamp(0.0, 1.0)
 
 
 def summary(posterior: Posterior) -> tuple[Tensor, Tensor]:

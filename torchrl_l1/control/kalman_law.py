@@ -40,6 +40,7 @@ class Estimate(NamedTuple):
     Attributes:
         posterior: posterior of the matched disturbance; zero where it is not finite.
         noise: running ratios of the residuals' squares to their expected values ``(..., n)``.
+        skill: sums of :func:`~.kalman.record_forecast` ``(..., 2)``; ``None`` without.
         innovation: the prediction's error ``(..., n)``, state units.
         residual: the model's error ``(..., n)``: the innovation plus the effect expected of the
             disturbance.
@@ -49,6 +50,7 @@ class Estimate(NamedTuple):
 
     posterior: Posterior
     noise: Tensor
+    skill: Tensor | None
     innovation: Tensor
     residual: Tensor
     effect_matched: Tensor
@@ -195,19 +197,29 @@ def estimate(
         ratio = kalman.noise_ratio(covariance, jacobian, posterior, left, unknown)
         noise = torch.where(fresh, noise, torch.lerp(ratio, noise, config.forgetting))
 
+    skill = past.skill
+    if skill is not None:
+        forecast = (columns @ prior.mean.unsqueeze(-1)).squeeze(-1)
+        skill = skill.masked_fill(fresh, 0.0)
+        skill = kalman.record_forecast(skill, forecast, white, config.skill_forgetting)
+
     flat = posterior.covariance.flatten(-2)
-    finite = is_finite(torch.cat([observation, posterior.mean, flat, noise], -1))
+    entries = [observation, posterior.mean, flat, noise, *([] if skill is None else [skill])]
+    finite = is_finite(torch.cat(entries, -1))
+    skill = None if skill is None else skill.masked_fill(~finite, 0.0)
     posterior = Posterior(
         project(config, posterior.mean.masked_fill(~finite, 0.0)),
         posterior.covariance.masked_fill(~finite.unsqueeze(-1), 0.0),
     )
     effect = (jacobian @ posterior.mean.unsqueeze(-1)).squeeze(-1)
-    return Estimate(posterior, noise, innovation, residual, effect, finite)
+    return Estimate(posterior, noise, skill, innovation, residual, effect, finite)
 
 
 def adapted(config: L1Config, estimated: Estimate, u_rl: Tensor) -> ControlInput:
     """The input that cancels the significant part of an estimate, within the bounds."""
     q = kalman.significant(estimated.posterior, config.dead_zone)
+    if estimated.skill is not None:
+        q = kalman.skill(estimated.skill) * q
     return ControlInput.of(config, wide(u_rl), q)
 
 
@@ -266,6 +278,7 @@ def follow(
         noise=estimated.noise.masked_fill(non_finite, 1.0),
         jacobian=jacobian.flatten(-2).masked_fill(non_finite, 0.0),
         residual_covariance=_remembered(state, residuals, observation, non_finite),
+        skill=None if estimated.skill is None else estimated.skill.masked_fill(non_finite, 0.0),
     )
     terms = Terms(
         -estimated.innovation,
@@ -287,17 +300,20 @@ class _Memory(NamedTuple):
     covariance: Tensor
     noise: Tensor
     jacobian: Tensor
+    skill: Tensor | None
 
 
 def _memory(config: L1Config, state: L1State) -> _Memory:
     covariance, noise, jacobian = state.covariance, state.noise, state.jacobian
     expected, varies = state.residual_covariance, config.covariance != "residuals"
-    if covariance is None or noise is None or jacobian is None or varies == (expected is None):
+    skill, judged = state.skill, config.skill_forgetting < 1
+    is_whole = varies == (expected is not None) and judged == (skill is not None)
+    if covariance is None or noise is None or jacobian is None or not is_whole:
         raise ValueError(
             "the state belongs to a controller with other settings: make it with "
             "init(batch_size, observation_dim, action_dim, config)"
         )
-    return _Memory(covariance, noise, jacobian)
+    return _Memory(covariance, noise, jacobian, skill)
 
 
 def _expected_covariance(

@@ -29,6 +29,8 @@ class L1State(NamedTuple):
         jacobian: Jacobian of the last step ``(..., n * m)``.
         residual_covariance: covariance expected at the last step ``(..., n * n)``; ``None`` if it
             is the same everywhere.
+        skill: what past forecasts of the disturbance have gained and promised ``(..., 2)``;
+            ``None`` if the settings do not ask for it.
     """
 
     x_hat: Tensor
@@ -41,6 +43,7 @@ class L1State(NamedTuple):
     noise: Tensor | None = None
     jacobian: Tensor | None = None
     residual_covariance: Tensor | None = None
+    skill: Tensor | None = None
 
     def entries(self) -> dict[str, Tensor]:
         """The entries that are not ``None``, by name."""
@@ -135,6 +138,8 @@ def init(
         memory["jacobian"] = zeros(observation_dim * action_dim, dtype)
         if config.covariance != "residuals":
             memory["residual_covariance"] = zeros(observation_dim**2, dtype)
+        if config.skill_forgetting < 1:
+            memory["skill"] = zeros(2, dtype)
     return L1State(
         x_hat=zeros(observation_dim, dtype),
         u_bar=zeros(action_dim, dtype),
