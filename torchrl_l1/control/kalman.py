@@ -7,7 +7,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-
 TRUST = 10.0
 """Gain and promise of forecasts before any: so many squares of one standard deviation."""
 
@@ -166,7 +165,9 @@ def significant(posterior: Posterior, dead_zone: float) -> Tensor:
     return posterior.mean * (1 - dead_zone**2 * variance / square).clamp_min(0)
 
 
-def record_forecast(sums: Tensor, forecast: Tensor, innovation: Tensor, forgetting: float) -> Tensor:
+def record_forecast(
+    sums: Tensor, forecast: Tensor, innovation: Tensor, forgetting: float
+) -> Tensor:
     r"""Sums over past steps of what forecasts of the residual have gained and promised.
 
     A forecast :math:`f` of a residual :math:`r` takes :math:`|r|^2 - |r - f|^2` off its square.
