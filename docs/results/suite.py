@@ -1,12 +1,14 @@
 """The suite of disturbances on frozen policies: off, the paper's, the robust one, the oracle.
 
     python docs/results/suite.py [FOLDER]
+    python docs/results/suite.py whole FOLDER
 
-Reads the episodes that `torchrl-l1 evaluate --suite quick` (or `full`) wrote into
-FOLDER/TASK/seed_N, if a FOLDER is given, and keeps their returns in `suite/TASK.csv` beside this
-file, in place of those of the same policy and controller. Writes from those `suite/TASK.md`, one
-row per disturbance, `suite/TASK_values.md`, one row per value of it, and `suite/verdicts.md` and
-`.png`, disturbances by tasks.
+Reads the episodes that `torchrl-l1 evaluate --suite full` wrote into FOLDER/TASK/seed_N, if a
+FOLDER is given, and keeps their returns in `suite/TASK.csv` beside this file, in place of those of
+the same policy and controller; with `whole` those of the robust controller alone, as that which
+acts on its whole estimate. Writes from those `suite/TASK.md`, one row per disturbance,
+`suite/TASK_values.md`, one row per value of it, `suite/verdicts.md` and `.png`, disturbances by
+tasks, and `suite/record.md`, what the robust controller's record of its forecasts changes.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from torchrl_l1.report.statistics import Interval, mean_interval
 HERE = Path(__file__).with_name("suite")
 TASKS = ("inverted_pendulum", "swimmer", "hopper", "walker", "half_cheetah")
 CONTROLLERS = ("paper", "robust", "oracle")
+WHOLE = "whole"  # the robust controller with skill_forgetting=1
 NONE = ("none", 0.0)
 Cell = tuple[str, float]
 # Returns of the episodes, by policy, controller and (disturbance, value).
@@ -53,13 +56,19 @@ def cell_of(row: dict[str, str]) -> Cell:
     return found[0] if found else NONE
 
 
-def gather(folder: Path, task: str) -> None:
-    """Keep the returns of all policies and controllers of a task in one file."""
+def gather(folder: Path, task: str, renamed: dict[str, str] | None = None) -> None:
+    """Keep the returns of all policies and controllers of a task in one file.
+
+    Of controllers that get another name, those alone.
+    """
     rows: dict[tuple[str, str, str, float], list[str]] = {}
     for file in sorted(folder.glob(f"{task}/seed_*/episodes.csv")):
         with file.open(newline="") as handle:
             for row in csv.DictReader(handle):
-                key = (file.parts[-2], row["l1"], *cell_of(row))
+                if renamed is not None and row["l1"] not in renamed:
+                    continue
+                l1 = (renamed or {}).get(row["l1"], row["l1"])
+                key = (file.parts[-2], l1, *cell_of(row))
                 rows.setdefault(key, []).append(f"{float(row['return']):.6g}")
     if not rows:
         return
@@ -178,6 +187,30 @@ def groups_of(returns: Returns) -> dict[str, list[Cell]]:
     return {name: cells for name, cells in groups.items() if cells}
 
 
+def record(of: dict[str, Returns]) -> str:
+    """Verdicts on the robust controller that its record of forecasts changes: without / with."""
+    of = {task: every for task, every in of.items() if any(key[1] == WHOLE for key in every)}
+    lines = []
+    for name, entry in DISTURBANCES.items():
+        line = {"disturbance": entry.words}
+        for task, returns in of.items():
+            cells = groups_of(returns).get(name)
+            both = [verdict(returns, l1, cells) for l1 in (WHOLE, "robust") if cells]
+            line[task.replace("_", " ")] = " / ".join(both) if len(set(both)) == 2 else ""
+        if any(list(line.values())[1:]):
+            lines.append(line)
+    for kinds in (("worse",), ("helped", "cancelled")):
+        line = {"disturbance": f"number of *{' or '.join(kinds)}*"}
+        for task, returns in of.items():
+            counts = [
+                sum(verdict(returns, l1, cells) in kinds for cells in groups_of(returns).values())
+                for l1 in (WHOLE, "robust")
+            ]
+            line[task.replace("_", " ")] = " / ".join(map(str, counts))
+        lines.append(line)
+    return markdown(lines)
+
+
 def plot(of: dict[str, Returns], file: Path) -> None:
     """Changes of the return by the two controllers: disturbances by tasks."""
     names = [name for name in DISTURBANCES if any(name in groups_of(one) for one in of.values())]
@@ -214,8 +247,11 @@ def main() -> None:
     """Read what is new, then write all tables and the figure."""
     of: dict[str, Returns] = {}
     for task in TASKS:
-        if len(sys.argv) > 1:
-            gather(Path(sys.argv[1]), task)
+        match sys.argv[1:]:
+            case ["whole", folder]:
+                gather(Path(folder), task, {"robust": WHOLE})
+            case [folder]:
+                gather(Path(folder), task)
         if (HERE / f"{task}.csv").exists():
             of[task] = read(task)
     words = {
@@ -237,6 +273,7 @@ def main() -> None:
             verdicts = [verdict(returns, l1, cells) for l1 in ("paper", "robust") if cells]
             line[column] = " / ".join(verdicts) or "–"
     (HERE / "verdicts.md").write_text(markdown(list(words.values())) + "\n")
+    (HERE / "record.md").write_text(record(of) + "\n")
     plot(of, HERE / "verdicts.png")
     print(f"Tables and figure: {HERE}")
 

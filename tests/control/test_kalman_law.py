@@ -15,7 +15,7 @@ from torchrl_l1.control import (
     init,
     step,
 )
-from torchrl_l1.control.kalman_law import estimate
+from torchrl_l1.control.kalman_law import adapted, estimate
 
 BOUNDS = {"action_low": -1.0, "action_high": 1.0}
 
@@ -35,6 +35,7 @@ PRIOR = np.array([[0.5, 0.1], [0.1, 0.4]])
 NOISE = np.array([9.0, 1.0, 0.5])
 SEEN = np.array([[1.0, 0.2], [0.3, -0.8], [0.1, 0.4]])
 COVARIANCE = 0.001 * np.array([[4.0, 1.0, 0.0], [1.0, 9.0, 2.0], [0.0, 2.0, 16.0]])
+SKILL = np.array([-9.0, 8.0])  # gained and promised before
 INFLATION, PROCESS_NOISE = 2.0, 0.1
 SMALL, HUGE = np.array([0.1, -0.1, 0.1]), np.array([1.8, 5.7, -1.8])  # what it misses
 
@@ -48,6 +49,7 @@ def given(config: L1Config, missed: np.ndarray) -> tuple[L1State, torch.Tensor, 
         covariance=torch.as_tensor(PRIOR).flatten(),
         noise=torch.as_tensor(NOISE),
         jacobian=torch.as_tensor(SEEN).flatten(),
+        skill=torch.as_tensor(SKILL) if config.skill_forgetting < 1 else None,
     )
     statistics = ResidualStatistics(torch.as_tensor(COVARIANCE), INFLATION, PROCESS_NOISE)
     return state, torch.as_tensor(X_HAT + missed), statistics
@@ -67,6 +69,57 @@ def expected(missed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, fl
     return mean, covariance, square / np.diag(INFLATION * COVARIANCE), doubt
 
 
+def forecast_before(missed: np.ndarray) -> tuple[float, float]:
+    """What the estimate before the step took off the square of the residual, and promised to."""
+    scale = np.sqrt(np.array([9.0, 1.0, 1.0]) * (9.0 + 1.0 + 1.0) / 3)
+    doubt = expected(missed)[3]
+    weight = np.linalg.inv(doubt * INFLATION * COVARIANCE * np.outer(scale, scale))
+    forecast, residual = SEEN @ MEAN, SEEN @ MEAN + missed
+    gained = residual @ weight @ residual - missed @ weight @ missed
+    return gained, forecast @ weight @ forecast
+
+
+WRONG = -4 * SEEN @ MEAN  # the residual is thrice the forecast, with the other sign
+
+
+@pytest.mark.parametrize("missed", [SMALL, WRONG, HUGE], ids=["small", "wrong", "huge"])
+def test_the_input_is_scaled_by_what_forecasts_have_gained_of_what_they_promised(missed):
+    config = L1Config.robust(0.05, skill_forgetting=0.9, dead_zone=0.0, **BOUNDS)
+    gained, promised = forecast_before(missed)
+    found = estimate(config, *given(config, missed))
+    sums = 0.9 * SKILL + [gained, promised]
+    np.testing.assert_allclose(found.skill, sums)
+    share = (sums[0] + 10) / (sums[1] + 10)
+    assert (share < 0) == (missed is WRONG)
+    acted = adapted(config, found, torch.zeros(2, dtype=torch.float64)).q
+    np.testing.assert_allclose(acted, min(max(share, 0.0), 1.0) * found.posterior.mean)
+
+
+@pytest.mark.parametrize(("period", "low", "high"), [(None, 0.99, 1.0), (4, 0.0, 0.2)])
+def test_a_lasting_disturbance_is_acted_on_and_one_that_outruns_the_estimate_is_not(
+    period, low, high
+):
+    rng = np.random.default_rng(0)
+    found = {}
+    for forgetting in (0.99, 1.0):
+        config = L1Config.robust(
+            0.05, skill_forgetting=forgetting, process_noise=0.3, forgetting=1.0, dead_zone=0.0,
+            **BOUNDS,
+        )  # fmt: skip
+        statistics = ResidualStatistics(0.0001 * torch.eye(2, dtype=torch.float64))
+        state = init([], 2, 1, config, dtype=torch.float64)
+        zero, x, acted = torch.zeros(2, dtype=torch.float64), torch.zeros(2).double(), []
+        jacobian = torch.tensor([[0.5], [0.2]], dtype=torch.float64)
+        for t in range(600):
+            u, state, _ = step(config, state, x, zero[:1], zero, jacobian, residuals=statistics)
+            sign = 1.0 if period is None or t % period < period // 2 else -1.0
+            x = x + jacobian @ (u + 0.4 * sign) + 0.01 * torch.as_tensor(rng.normal(size=2))
+            acted.append(state.q.abs().item())
+        found[forgetting] = np.mean(acted[300:])
+    assert low <= found[0.99] / found[1.0] <= high
+    assert found[1.0] > 0.2
+
+
 @pytest.mark.parametrize("missed", [SMALL, HUGE], ids=["small", "huge"])
 def test_an_estimate_is_that_of_the_documented_formulas(missed):
     config = L1Config.robust(0.05, forgetting=0.9, **BOUNDS)
@@ -83,7 +136,7 @@ def test_an_estimate_is_that_of_the_documented_formulas(missed):
 
 
 def test_the_diagnostics_are_those_of_the_estimate():
-    config = L1Config.robust(0.05, dead_zone=0.1, **BOUNDS)
+    config = L1Config.robust(0.05, dead_zone=0.1, skill_forgetting=1.0, **BOUNDS)
     state, observation, statistics = given(config, SMALL)
     zero, jacobian = torch.zeros(3, dtype=torch.float64), torch.as_tensor(SEEN)
     *_, found = step(config, state, observation, zero[:2], zero, jacobian, residuals=statistics)
@@ -114,7 +167,7 @@ class Uneven:
 def test_a_residual_is_weighed_by_what_was_expected_of_the_last_executed_input():
     config = L1Config.robust(
         0.05, covariance="sum", process_noise=0.1, inflation=2.0, forgetting=1.0, dead_zone=0.0,
-        initial_deviation=0.5,
+        initial_deviation=0.5, skill_forgetting=1.0,
     )  # fmt: skip
     rng, model = np.random.default_rng(0), ActionJacobian(Uneven())
     state = init([], 2, 1, config, dtype=torch.float64)

@@ -405,6 +405,7 @@ NEWER |= {
     "l1.inflation": None,
     "l1.initial_deviation": 0.3,
     "l1.forgetting": 0.97,
+    "l1.skill_forgetting": 1.0,
 }
 
 NEWER_IN_EVALUATIONS = {

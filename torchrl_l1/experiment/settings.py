@@ -60,6 +60,8 @@ class L1Settings:
         inflation: factor on the covariance; if null, what the model says of itself, or else 1.
         initial_deviation: standard deviation of the disturbance at a reset, same units.
         forgetting: factor per step of the running estimate of each state's noise; 1 for none.
+        skill_forgetting: factor per step of the record of what its forecasts have gained, by which
+            the input is scaled; 1 for none.
         compile: compile the controller's step: ``true``, ``false``, or ``auto`` where a compiler
             works. It takes some tens of seconds and pays in long collections.
     """
@@ -81,6 +83,7 @@ class L1Settings:
     inflation: float | None = None
     initial_deviation: float = 0.3
     forgetting: float = 0.97
+    skill_forgetting: float = 1.0
     compile: bool | str = False
 
 
