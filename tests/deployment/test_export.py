@@ -137,9 +137,7 @@ def test_transforms_of_the_environment_are_named(robust, tmp_path):
     source = environment_source(make)
     other = RobustController(source, robust.policy, robust.model, robust.configs)
     names = ("ActionScaling", "ObservationNorm", "CatTensors(scaled)")
-    with pytest.warns(
-        UserWarning, match=r"send on its actions, through ActionScaling, Obs.*scaled"
-    ):
+    with pytest.warns(UserWarning, match=r"apply ActionScaling, Obs.*scaled"):
         assert export(other, tmp_path / "policy.pt", steps=5).transforms == names
     assert export(robust, tmp_path / "policy.pt", steps=5).transforms == ()
 
@@ -315,7 +313,9 @@ def test_files_of_the_policy_are_not_replaced(robust, tmp_path, monkeypatch):
 
 
 def test_other_suffixes_are_refused(robust, tmp_path):
-    with pytest.raises(ValueError, match=r"policy.json must end in .pt, .ts, .onnx, .pt2, or form"):
+    with pytest.raises(
+        ValueError, match=r"policy.json must end in .pt, .ts, .onnx, .pt2; otherwise give a form"
+    ):
         export(robust, tmp_path / "policy.json")
 
 

@@ -124,7 +124,7 @@ def test_checkpoints_of_other_iterations_are_no_seeds_of_one_training(
     files = [str(first / "after_2.pt"), str(second / "after_1.pt")]
     with pytest.raises(SystemExit):
         main(["evaluate", *files, "--episodes", "1", "--l1", "off"])
-    line = f"{files[0]} is of 2 iterations and {files[1]} of 1; let both get equally far"
+    line = f"{files[0]} is of 2 iterations and {files[1]} of 1; train both equally far"
     assert line in capsys.readouterr().err
     # The best may come at any time.
     (first / "best.pt").unlink()

@@ -55,7 +55,7 @@ def test_a_minari_dataset_is_read_by_its_folder_too(episodes: list[Episode]) -> 
     assert dataset.spec.env_spec.id == "torchrl_l1/InvertedPendulum-v0"
     assert dataset.observation_space.dtype == dataset.action_space.dtype == np.float32
     (folder / "data" / "metadata.json").write_text("{")
-    with pytest.raises(ValueError, match="no Minari dataset that can be read"):
+    with pytest.raises(ValueError, match="is not a readable Minari dataset"):
         read_dataset(str(folder))
 
 
@@ -145,7 +145,7 @@ def test_of_a_replay_buffer_what_it_holds(storage: type[LazyTensorStorage]) -> N
     found = read_dataset("rb")
     assert found["observation"].flatten().tolist() == [16, 17, 18, 4, 5, *range(1, 16)]
     Path("rb/storage/storage_metadata.json").write_text("{")
-    with pytest.raises(ValueError, match="no tensordict that can be read"):
+    with pytest.raises(ValueError, match="is not a readable tensordict"):
         read_dataset("rb")
 
 
@@ -169,7 +169,7 @@ def test_the_empty_rest_of_a_buffer_s_own_folder_is_told() -> None:
 
 def test_a_table_needs_names() -> None:
     Path("drive.csv").write_text("t,a,b,u\n0,0,0,1\n0.1,1,0,1\n0.2,2,1,0\n")
-    with pytest.raises(ValueError, match="say which columns are what"):
+    with pytest.raises(ValueError, match="name its columns"):
         read_dataset("drive.csv")
     columns = DatasetColumns(["a", "b"], ["u"], time="t")
     assert read_dataset("drive.csv", columns)["next", "observation"].tolist() == [[1, 0], [2, 1]]
@@ -233,7 +233,7 @@ def test_what_is_no_dataset_is_refused_in_one_line(episodes: list[Episode]) -> N
         "list.pt": "no dictionary of tensors",
         "flat.pt": r"with 'observation' of shape \[N, n\]",
         "ragged.pt": "not one row for each of 'observation'",
-        "twice.safetensors": "'next' and 'next.observation' in it: leave one of them out",
+        "twice.safetensors": "holds both 'next' and 'next.observation': leave one of them out",
         "bomb.pt": "cannot be read as plain tensors",
         "pickled": "is a pickle, which is not read",
     }.items():
@@ -353,7 +353,7 @@ def test_what_a_command_refuses(
     Path("there.npz").write_text("")
     for arguments, words in (
         (["nowhere", "a.npz"], "holds no run"),
-        (["nowhere", "there.npz"], "is there already"),
+        (["nowhere", "there.npz"], "already exists"),
     ):
         with pytest.raises(SystemExit):
             main(["dataset", *arguments])

@@ -151,7 +151,7 @@ def test_a_copy_of_a_run_is_no_second_seed(
     shutil.copytree(directory, tmp_path / "copy")
     with pytest.raises(SystemExit):
         main(["evaluate", str(directory), str(tmp_path / "copy"), "--episodes", "1"])
-    assert "are both of seed 0, one training and no two" in capsys.readouterr().err
+    assert "are both of seed 0, so they are one training" in capsys.readouterr().err
 
 
 def test_cells_share_their_random_numbers_and_see_their_disturbance(tiny_recipe: Recipe) -> None:

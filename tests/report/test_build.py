@@ -341,7 +341,7 @@ def test_every_file_that_cannot_be_read_is_listed(write_run: WriteRun, tmp_path:
         strict=True,
     ):
         assert f"{run}/{words}" in text
-    assert "aliases that make it too large" in text
+    assert "aliases that expand it too far" in text
     assert "is no campaign file" in text
 
 

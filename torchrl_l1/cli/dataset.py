@@ -26,8 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--quality",
         choices=QUALITIES,
         default="expert",
-        help="random actions; the policy with enough noise to reduce its return to between a third "
-        "and a half; or the policy",
+        help="random actions; the policy with enough noise for a return a third to a half of the "
+        "way from random to expert; or the policy",
     )
     add("--steps", type=int, default=20_000, help="minimum number of steps, in whole episodes")
     add("--seed", type=int, default=0, help="seed of resets, actions and noise")

@@ -238,8 +238,8 @@ def export(
     outside = tuple(_outside(robust.source.one()))
     if outside:
         warnings.warn(
-            f"{file} does not include the environment's transforms between plant and policy: pass "
-            f"observations to it, and its actions on, through {', '.join(outside)}",
+            f"{file} does not include the environment's transforms between plant and policy: apply "
+            f"{', '.join(outside)} to its observations and actions",
             stacklevel=2,
         )
     write_atomically(file, content)
