@@ -106,7 +106,7 @@ def test_a_recipe_is_copied_to_be_edited(capsys: pytest.CaptureFixture[str]) -> 
     assert capsys.readouterr().out == "mine.yaml is yours: torchrl-l1 run mine.yaml\n"
     main(["run", "mine.yaml", "seed=7", "--cfg", "job"])
     assert "recipe: mine" in capsys.readouterr().out
-    assert "is there already" in refused(
+    assert "already exists" in refused(
         ["recipes", "--copy", "metrpo/inverted_pendulum", "mine.yaml"], capsys
     )
     assert "NAME" in refused(["recipes", "--copy", "a", "b", "c"], capsys)

@@ -85,7 +85,7 @@ def test_what_differs_from_the_checkpoint_is_seen_and_written_again(
     if name == "metrics.csv":
         assert RunDirectory(damaged).iterations_done() < 2
     run(tiny_recipe("resume=true"))
-    assert f"written again from the checkpoint: {name}" in capsys.readouterr().out
+    assert f"rewritten from the checkpoint: {name}" in capsys.readouterr().out
     assert same_files(damaged, whole)
 
 

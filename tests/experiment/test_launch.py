@@ -164,8 +164,8 @@ def test_errors_are_a_line_that_does_not_repeat_the_command(
     [
         ("defaults: [metrpo_recipe\nrecipe: own", "line 2, column"),
         ("recipe: own\ntask inverted", "line 2"),
-        ("- a\n- b\n", "no keys and values"),
-        ("", "no keys and values"),
+        ("- a\n- b\n", "no mapping of keys to values"),
+        ("", "no mapping of keys to values"),
         ("recipe: own\ntask: swimmer\n", "has no schema"),
         (OWN + "discont: 3\n", "discont"),
         (OWN + "discount: high\n", "high"),
@@ -175,7 +175,7 @@ def test_errors_are_a_line_that_does_not_repeat_the_command(
             "a: &a [x, x]\n" + "".join(f"a{i}: &a{i} [*a, *a]\n" for i in range(9)) + "b: [\n",
             "line",
         ),
-        ("a: &a [*a]\n", "too large"),
+        ("a: &a [*a]\n", "expand it too far"),
         ("a: !!python/object/apply:os.mkdir [harm]\n" + OWN, "python"),
     ],
 )
