@@ -103,7 +103,7 @@ def test_a_campaign_is_data_too(tmp_path: Path) -> None:
         "matrix: {hydra.verbose: [true]}",
     ):
         file.write_text(f"runs: [{{recipe: {PENDULUM}, {entry}}}]\n")
-        with pytest.raises(CampaignError, match="sets up Hydra"):
+        with pytest.raises(CampaignError, match="configures Hydra"):
             read_campaign(str(file))
 
 
