@@ -213,7 +213,7 @@ def test_refused_on_the_command_line(
     file, output = write(RUNS), str(tmp_path / "out")
     for more, message in [
         (["--workers", "0"], "--workers must be at least 1"),
-        (["seed=3"], "seed is set by overrides and by the matrix"),
+        (["seed=3"], "seed is set both by overrides and by the matrix"),
         (["hydra.launcher.n_jobs=2"], "give --launcher"),
         (["noise"], "KEY=VALUE"),
         (["--fast"], "unrecognized arguments: --fast"),

@@ -151,7 +151,7 @@ def test_the_checkpoint_before_is_used_in_place_of_one_that_cannot_be_read(
     with pytest.raises(RunDirectoryError, match="resume the run"):
         load_run(damaged, last=True)
     assert load_run(damaged).algorithm.iteration == 1
-    assert "checkpoint_previous.pt is used, of 1 iterations" in capsys.readouterr().err
+    assert "checkpoint_previous.pt of 1 iterations is used instead" in capsys.readouterr().err
     run(tiny_recipe("resume=true"))
     lines = [line for line in capsys.readouterr().out.splitlines() if "cannot be read" in line]
     assert len(lines) == 1 and str(file) in lines[0]

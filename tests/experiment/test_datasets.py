@@ -93,12 +93,12 @@ def test_what_columns_name_counts_beside_the_usual_names(source: str) -> None:
     assert (read_dataset(source)["observation"] == 0).all()
     for columns, words in {
         "observation=[speed]": "'speed'|no speed, only action, executed, next.l1.u_exec",
-        "action=[torque]": "no torque, only .*: name it, columns.action",
+        "action=[torque]": "no torque, only .*: name it with columns.action",
         "observation=[executed]": "no next.executed, what followed",
         "observation=[state.x]": "'state.x' of shape|no state.x, only [^\n]*$",
         "action=[action.u]": "no action.u, only [^\n]*$",
         "observation=[state,observation]": "have one observation, not state, observation",
-        "episode=run": "columns.episode is of .csv and .npz files",
+        "episode=run": "columns.episode is only for .csv and .npz files",
         "time=t": "columns.time is of .csv",
     }.items():
         key, _, value = columns.partition("=")
@@ -227,7 +227,7 @@ def test_what_is_no_dataset_is_refused_in_one_line(episodes: list[Episode]) -> N
         "": "set dataset=",
         "nowhere": "torchrl-l1 dataset RUN_DIR nowhere makes one",
         "empty": "holds no dataset",
-        "data.txt": "is no dataset: there are .csv",
+        "data.txt": "is no dataset: use a folder or a file that ends in .csv",
         "torn.npz": "no readable .npz file",
         "torn.safetensors": "damaged",
         "list.pt": "no dictionary of tensors",

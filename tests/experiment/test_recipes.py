@@ -258,7 +258,7 @@ def test_a_recipe_that_is_called_like_a_schema_is_named(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("defaults: [metrpo/swimmer, _self_]\n")
     (tmp_path / "pets.yaml").write_text("defaults: [pets/half_cheetah, _self_]\n")
     for name in ("metrpo_recipe", "mine"):
-        with pytest.raises(RecipeError, match=r"metrpo_recipe.yaml is called like the schema"):
+        with pytest.raises(RecipeError, match=r"metrpo_recipe.yaml has the name of the schema"):
             compose(str(tmp_path / f"{name}.yaml"))
     assert compose(str(tmp_path / "pets.yaml")).recipe == "pets"
 

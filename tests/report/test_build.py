@@ -107,7 +107,7 @@ def test_report_joins_tables_and_figures(campaign: Path, tmp_path: Path) -> None
         assert f"\n## {heading}\n" in text
     assert "10 runs, of which 9 are finished" in text
     assert "seed 3: 2 of 5 iterations" in text
-    assert "9 of 21 runs finished, 12 not begun, 1 here that it does not ask for" in text
+    assert "9 of 21 runs finished, 12 not begun, 1 others in its folder" in text
     assert f"$ torchrl-l1 campaign figure2 --output {campaign}\n" in text
     assert f"--reference-curves {curves}\n" in text
     assert "| torch | 2.13.0 | 10 |" in text
