@@ -127,7 +127,7 @@ def test_a_users_recipe_is_found_beside_the_campaign(write: Any, tmp_path: Path)
         ("runs: [{recipe: }]", "recipe must be the name of a recipe .* got None"),
         ("runs: [{recipe: [a]}]", r"recipe must be the name of a recipe .* got \['a'\]"),
         ("runs: [{recipe: offline/half_cheetah, overrides: [reward=learned]}]",
-         "offline learning goes by rewards"),
+         "offline learning needs known rewards"),
         ("runs: [{recipe: metrpo/pendulum}]", "unknown recipe 'metrpo/pendulum'"),
         ("runs: [{recipe: mine2.yaml}]", "mine2.yaml does not exist"),
         (RUNS.replace("matrix", "matrices"), "Did you mean matrix"),
