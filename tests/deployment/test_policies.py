@@ -50,7 +50,7 @@ def test_actions_stay_within_the_bounds(env):
     [
         (lambda x: torch.zeros(7), "expected an action of width 1"),
         (lambda x: x.no_such_thing, "failed at an observation of width 4"),
-        (3, "int is no policy"),
+        (3, "int is not a policy"),
         ("nothing", "unknown policy 'nothing'; policies are sb3"),
         ("math:no_such_name", "no 'no_such_name'"),
     ],
@@ -85,7 +85,7 @@ def test_weights_that_are_pickles_of_objects_are_refused(env, policy_file, tmp_p
 def test_weights_that_are_something_else_are_refused(env, policy_file, tmp_path, content):
     file = tmp_path / "weights.pt"
     file.write_bytes(content)
-    with pytest.raises(ValueError, match=r"weights\.pt is no state dict"):
+    with pytest.raises(ValueError, match=r"weights\.pt is not a state dict"):
         load_policy(f"{policy_file}:network", env, weights=str(file))
 
 

@@ -162,7 +162,7 @@ def test_what_is_named_is_found_from_any_folder(robust, policy_file, tmp_path, m
 
 def test_objects_are_asked_for_again(robust, tmp_path):
     folder = robust.save(tmp_path)
-    with pytest.raises(ValueError, match="names no policy, which was an object"):
+    with pytest.raises(ValueError, match="does not name the policy, which was an object"):
         RobustController.load(folder)
     assert RobustController.load(folder, policy=balance).configs == robust.configs
     stored = json.loads((folder / "controller.json").read_text())

@@ -95,7 +95,7 @@ def test_what_a_kill_has_come_before_is_kept_when_the_run_goes_on(tiny_recipe: R
 def test_kept_checkpoints_that_cannot_be_used_are_a_line(tiny_recipe: Recipe) -> None:
     run_dir = run(tiny_recipe(*KEEP))
     file = run_dir / "checkpoints" / "after_2.pt"
-    with pytest.raises(RunDirectoryError, match="it is no file"):
+    with pytest.raises(RunDirectoryError, match="it is not a file"):
         load_run(file.with_name("after_9.pt"))
     content = file.read_bytes()
     file.unlink()

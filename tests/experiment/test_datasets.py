@@ -227,7 +227,7 @@ def test_what_is_no_dataset_is_refused_in_one_line(episodes: list[Episode]) -> N
         "": "set dataset=",
         "nowhere": "torchrl-l1 dataset RUN_DIR nowhere makes one",
         "empty": "holds no dataset",
-        "data.txt": "is no dataset: use a folder or a file that ends in .csv",
+        "data.txt": "is not a dataset: use a folder or a file that ends in .csv",
         "torn.npz": "no readable .npz file",
         "torn.safetensors": "damaged",
         "list.pt": "no dictionary of tensors",

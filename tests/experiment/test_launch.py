@@ -164,8 +164,8 @@ def test_errors_are_a_line_that_does_not_repeat_the_command(
     [
         ("defaults: [metrpo_recipe\nrecipe: own", "line 2, column"),
         ("recipe: own\ntask inverted", "line 2"),
-        ("- a\n- b\n", "no mapping of keys to values"),
-        ("", "no mapping of keys to values"),
+        ("- a\n- b\n", "not a mapping of keys to values"),
+        ("", "not a mapping of keys to values"),
         ("recipe: own\ntask: swimmer\n", "has no schema"),
         (OWN + "discont: 3\n", "discont"),
         (OWN + "discount: high\n", "high"),

@@ -98,7 +98,7 @@ def test_a_new_recipe_composes_and_needs_no_fix(
     assert "the reward function reproduces the environment's rewards" in said
     with pytest.raises(SystemExit):
         main(["new-task", "swing.yaml", "--from", "gymnasium/Pendulum-v1"])
-    assert "exists already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
 
 
 def test_a_new_recipe_and_its_environment_may_have_any_path(

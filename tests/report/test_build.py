@@ -342,7 +342,7 @@ def test_every_file_that_cannot_be_read_is_listed(write_run: WriteRun, tmp_path:
     ):
         assert f"{run}/{words}" in text
     assert "aliases that expand it too far" in text
-    assert "is no campaign file" in text
+    assert "is not a campaign file" in text
 
 
 def test_text_from_files_is_text(write_run: WriteRun, tmp_path: Path) -> None:

@@ -293,7 +293,7 @@ def _add_evaluations(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
             texts = set(map(value_text, values))
             chosen = [run for run in chosen if run.values.get(key) in texts]
         if not chosen:
-            raise CampaignError(f"{place}: no run has all of where")
+            raise CampaignError(f"{place}: no run matches all of where")
         for run in chosen:
             _check_stages(place, run, settings.matrix["stage"])
             try:

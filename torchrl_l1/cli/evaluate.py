@@ -235,7 +235,7 @@ def _stages(runs: Sequence[TrainedRun], asked: Sequence[str]) -> list[str]:
         if stages != found[0]:
             raise ValueError(
                 f"{runs[0].path} has reached the stage {found[0][0]} and {trained.path} "
-                f"{stages[0]}; say with --stage which one to evaluate"
+                f"{stages[0]}; choose with --stage which one to evaluate"
             )
     if not asked and any(trained.checkpoint != "best" for trained in runs):
         for trained in runs:

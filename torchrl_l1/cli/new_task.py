@@ -54,7 +54,7 @@ def new_task_command(options: argparse.Namespace) -> None:
     if file.suffix != ".yaml":
         raise ValueError(f"{file} must end in .yaml")
     if file.exists():
-        raise ValueError(f"{file} exists already; choose another name")
+        raise ValueError(f"{file} already exists; choose another name")
     if options.dt is not None:
         check_positive("--dt", options.dt)
     if options.horizon is not None:

@@ -54,7 +54,7 @@ def read_controller(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
             for digests in (stored.get("files") or {}, stored.get("code") or {}):
                 names += [*digests.keys(), *digests.values()]
             if not all(name is None or isinstance(name, str) for name in names):
-                raise TypeError("a name in it is no text")
+                raise TypeError("a name in it is not text")
             configs = {name: L1Config(**values) for name, values in stored["configs"].items()}
             _ = configs[stored["preset"]]
             return stored, configs

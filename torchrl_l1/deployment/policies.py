@@ -239,12 +239,12 @@ def load_policy(
             stored = torch.load(weights, map_location="cpu", weights_only=True)
         except pickle.UnpicklingError:
             raise ValueError(
-                f"{weights} is no state dict, or holds more than tensors, and loading it would "
+                f"{weights} is not a state dict, or holds more than tensors, and loading it would "
                 "execute its contents: save module.state_dict()"
             ) from None
         except (EOFError, RuntimeError, LookupError, TypeError, AttributeError) as error:
             # Reading a file that is not a pickle may raise any of these.
-            raise ValueError(f"{weights} is no state dict: {_short(error)}") from error
+            raise ValueError(f"{weights} is not a state dict: {_short(error)}") from error
         try:
             found.load_state_dict(stored)
         except (RuntimeError, TypeError, AttributeError) as error:
@@ -255,7 +255,7 @@ def load_policy(
         _check_keys(found, env)
         return found
     if not callable(found):
-        raise ValueError(f"a {type(found).__name__} is no policy; policies are {FORMS}")
+        raise ValueError(f"a {type(found).__name__} is not a policy; policies are {FORMS}")
     action = env.full_action_spec["action"]
     if isinstance(found, StableBaselinesPolicy):
         _warn_of_bounds(found, action)

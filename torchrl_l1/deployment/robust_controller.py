@@ -229,7 +229,9 @@ class RobustController:
         check_files(folder, stored.get("files") or {})
         for what, value in (("make_env", make_env), ("policy", policy)):
             if value is None and not stored["environment" if what == "make_env" else what]:
-                raise ValueError(f"{folder} names no {what}, which was an object: give it again")
+                raise ValueError(
+                    f"{folder} does not name the {what}, which was an object: give it again"
+                )
         # Newly given names are looked up here first.
         anew = [name for name in (make_env, policy) if isinstance(name, str)]
         search_path = [*folders_of(anew, [Path.cwd()]), *(stored.get("search_path") or ())]

@@ -59,11 +59,11 @@ def read_checkpoint(file: Path) -> dict[str, Any]:
     """
     try:
         if not file.is_file():
-            raise ValueError("it is no file")
+            raise ValueError("it is not a file")
         if file.stat().st_size == 0:
             raise ValueError("it is empty")
         if not zipfile.is_zipfile(file):
-            raise ValueError("it is cut off, or no checkpoint at all")
+            raise ValueError("it is cut off, or not a checkpoint at all")
         # torch itself does not compare checksums on reading.
         with zipfile.ZipFile(file) as archive:
             broken = archive.testzip()
@@ -73,7 +73,7 @@ def read_checkpoint(file: Path) -> dict[str, Any]:
             warnings.simplefilter("ignore")
             state = torch.load(file, weights_only=True, map_location="cpu")
         if not isinstance(state, dict):
-            raise ValueError(f"it holds a {type(state).__name__}, no checkpoint")
+            raise ValueError(f"it holds a {type(state).__name__}, not a checkpoint")
         for name, kind in _ENTRIES.items():
             if not isinstance(state.get(name), kind):
                 raise ValueError(f"it has no {name}")

@@ -75,7 +75,7 @@ def is_minari_name(text: str) -> bool:
 def _file(path: Path, columns: DatasetColumns) -> TensorDictBase:
     if path.suffix not in _FILES:
         raise ValueError(
-            f"{path} is no dataset: use a folder or a file that ends in {', '.join(_FILES)}"
+            f"{path} is not a dataset: use a folder or a file that ends in {', '.join(_FILES)}"
         )
     return _FILES[path.suffix](path, columns)
 
@@ -131,7 +131,7 @@ def _safetensors(path: Path, columns: DatasetColumns) -> TensorDictBase:
     try:
         flat = load_file(path)
     except SafetensorError as error:
-        raise ValueError(f"{path} is damaged or no safetensors file: {error}") from error
+        raise ValueError(f"{path} is damaged or not a safetensors file: {error}") from error
     data: dict[str, Any] = {}
     for name, value in flat.items():
         *places, last = re.split(r"[./]", name)
@@ -297,7 +297,7 @@ def _named(source: str, data: TensorDictBase, columns: DatasetColumns) -> Tensor
             following = _inside(data, ("next", *key))
             if name == "observation":
                 if following is None:
-                    raise KeyError(f"{source} has no next.{wanted}, what followed each step")
+                    raise KeyError(f"{source} has no next.{wanted}, which followed each step")
                 data = data.set(("next", name), following)
         if name == "action" and given:
             data = data.exclude("executed")  # that of a run would take precedence

@@ -212,7 +212,7 @@ def read_text(file: Path, most_bytes: int | None = None) -> str:
     if not file.is_file():
         if not file.exists():
             raise FileNotFoundError(2, "No such file or directory", str(file))
-        raise ValueError(f"{file} is no file")
+        raise ValueError(f"{file} is not a regular file")
     if most_bytes is not None and file.stat().st_size > most_bytes:
         raise ValueError(f"{file} is longer than {most_bytes} bytes")
     return file.read_text(encoding="utf-8")

@@ -224,7 +224,7 @@ def check_data(recipe: Path) -> None:
     except (OSError, ValueError, TypeError) as error:
         raise RecipeError(f"{recipe} cannot be read: {message(error)}") from error
     if not isinstance(content, dict):
-        raise RecipeError(f"{recipe} is no mapping of keys to values")
+        raise RecipeError(f"{recipe} is not a mapping of keys to values")
     defaults = content.get("defaults")
     named = [str(one) for one in defaults] if isinstance(defaults, list) else []
     if any(str(key).startswith("hydra") for key in content) or any(

@@ -143,7 +143,8 @@ def _about_data(task: AnyTask, data: TensorDictBase, horizon: int) -> Iterator[F
     if large:
         yield Finding(
             f"entries {large} of the observation spread over more than 10 000 units",
-            "rescale them in the environment: single precision and model.std_floor mind",
+            "rescale them in the environment: they are too large for single precision and "
+            "model.std_floor",
         )
 
 

@@ -204,7 +204,7 @@ def _read_campaign(folder: Path, runs: Sequence[Run]) -> CampaignState:
             for entry in content["runs"]
         ]
     except (AttributeError, IndexError, KeyError, TypeError, CampaignError) as error:
-        raise ValueError(f"{file} is no campaign file: {error!r}") from error
+        raise ValueError(f"{file} is not a campaign file: {error!r}") from error
     given: str | Path = file
     if name in available_campaigns():
         # The file in the folder includes the overrides of its command; the shipped one does not.
