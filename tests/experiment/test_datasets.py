@@ -94,7 +94,7 @@ def test_what_columns_name_counts_beside_the_usual_names(source: str) -> None:
     for columns, words in {
         "observation=[speed]": "'speed'|no speed, only action, executed, next.l1.u_exec",
         "action=[torque]": "no torque, only .*: name it with columns.action",
-        "observation=[executed]": "no next.executed, what followed",
+        "observation=[executed]": "no next.executed, which followed",
         "observation=[state.x]": "'state.x' of shape|no state.x, only [^\n]*$",
         "action=[action.u]": "no action.u, only [^\n]*$",
         "observation=[state,observation]": "have one observation, not state, observation",
