@@ -40,7 +40,7 @@ def read_dataset(source: str, columns: DatasetColumns | None = None) -> TensorDi
     Raises:
         FileNotFoundError: if there is no such dataset.
         KeyError: if it lacks a required entry, or one that ``columns`` names.
-        ValueError: if it cannot be read, is of an unknown kind, or takes no ``columns``.
+        ValueError: if it cannot be read, is of an unknown kind, or cannot use some ``columns``.
 
     Warns:
         UserWarning: if a tensordict ends in zeros, as a storage does that is not full.
