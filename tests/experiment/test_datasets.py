@@ -97,9 +97,9 @@ def test_what_columns_name_counts_beside_the_usual_names(source: str) -> None:
         "observation=[executed]": "no next.executed, which followed",
         "observation=[state.x]": "'state.x' of shape|no state.x, only [^\n]*$",
         "action=[action.u]": "no action.u, only [^\n]*$",
-        "observation=[state,observation]": "have one observation, not state, observation",
+        "observation=[state,observation]": "has one observation, not state, observation",
         "episode=run": "columns.episode is only for .csv and .npz files",
-        "time=t": "columns.time is of .csv",
+        "time=t": "columns.time is only for .csv",
     }.items():
         key, _, value = columns.partition("=")
         names: Any = value[1:-1].split(",") if value.startswith("[") else value
@@ -231,7 +231,7 @@ def test_what_is_no_dataset_is_refused_in_one_line(episodes: list[Episode]) -> N
         "torn.npz": "no readable .npz file",
         "torn.safetensors": "damaged",
         "list.pt": "no dictionary of tensors",
-        "flat.pt": r"with 'observation' of shape \[N, n\]",
+        "flat.pt": r"includes 'observation' of shape \[N, n\]",
         "ragged.pt": "not one row for each of 'observation'",
         "twice.safetensors": "holds both 'next' and 'next.observation': leave one of them out",
         "bomb.pt": "cannot be read as plain tensors",

@@ -248,7 +248,7 @@ def test_a_suite_ends_in_a_table_of_what_is_recovered(
         (["evaluate", "nowhere", "--epsilon", "1", "-1"], "--epsilon must be finite and not neg"),
         (["evaluate", "nowhere", "--epsilon", "inf"], "--epsilon must be finite and not negative"),
         (["evaluate", "nowhere", "--suite", "loud"], "argument --suite: invalid choice"),
-        (["evaluate", "nowhere", "--suite", "full", "--bias", "1"], "--suite and --bias both say"),
+        (["evaluate", "nowhere", "--suite", "full", "--bias", "1"], "--suite and --bias both set"),
         (["evaluate", "nowhere", "--suite", "full", "--filmstrip"], "instead of giving --suite"),
         (["evaluate", "nowhere", "--alpha", "0.1", "1.5"], "--alpha must be above 0 and at most 1"),
         (["evaluate", "nowhere", "--alpha", "nan"], "--alpha must be above 0 and at most 1"),
