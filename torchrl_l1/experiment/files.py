@@ -24,7 +24,7 @@ from torchrl_l1.experiment.errors import RunDirectoryError
 LONGEST_NAME = 120
 """Longest name made from settings, in characters; file systems take 255 bytes, some 143."""
 
-# Kept in names, so that the directories of older runs are found again; file systems allow them.
+# File systems allow names of this length, so that directories of older runs keep theirs.
 _LONGEST_OVERRIDES = 230
 _DIGEST = 10
 

@@ -30,7 +30,7 @@ from torchrl_l1.report.training import run_rows, training_sections
 
 def report_command(options: argparse.Namespace) -> None:
     """Write the report and print its path."""
-    # Imported packages stay in memory; frozen, they do not slow down collecting what figures leave.
+    # Imported packages stay. With them frozen, what figures leave soon dominates and is collected.
     gc.freeze()
     gc.collect()
     page = report(
