@@ -106,7 +106,7 @@ def test_a_recipe_is_copied_to_be_edited(capsys: pytest.CaptureFixture[str]) -> 
     assert capsys.readouterr().out == "mine.yaml is yours: torchrl-l1 run mine.yaml\n"
     main(["run", "mine.yaml", "seed=7", "--cfg", "job"])
     assert "recipe: mine" in capsys.readouterr().out
-    assert "is there already" in refused(
+    assert "already exists" in refused(
         ["recipes", "--copy", "metrpo/inverted_pendulum", "mine.yaml"], capsys
     )
     assert "NAME" in refused(["recipes", "--copy", "a", "b", "c"], capsys)
@@ -137,7 +137,7 @@ def test_a_closed_pipe_is_told_in_a_line() -> None:
     ended = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True)
     os.close(write)
     assert ended.returncode == 1
-    assert ended.stderr == "torchrl-l1 recipes: what reads the output has ended\n"
+    assert ended.stderr == "torchrl-l1 recipes: the reader of the output has exited\n"
 
 
 @pytest.mark.parametrize("more", [[], ["-m", "seed=0,1"]])
@@ -146,7 +146,7 @@ def test_a_run_has_one_option_of_a_group(
 ) -> None:
     """A list as in a campaign's matrix was one run with all of them, of which the last counts."""
     line = refused([*RUN, "run_dir=here", "l1=[off, paper]", *more], capsys)
-    assert "l1=[off, paper]: a run has one l1; -m l1=off,paper makes a run of each" in line
+    assert "l1=[off, paper]: a run has one l1; use -m l1=off,paper or" in line
     assert not list(Path.cwd().iterdir())
 
 

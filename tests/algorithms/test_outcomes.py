@@ -247,7 +247,7 @@ def test_who_ends_what_is_imagined() -> None:
 BAD = {
     "lacking": ("", "has no 'f'"),
     "broken": ("import nowhere_at_all", "No module named 'nowhere_at_all'"),
-    "number": ("f = 3", "names a int, no function"),
+    "number": ("f = 3", "names a int, not a function"),
     "raises": ("def f(*a):\n    raise KeyError('speed')", "failed on tensors of shape .* KeyError"),
     "arguments": ("def f():\n    return 1", "failed on tensors of shape"),
     "shape": ("def f(*a):\n    return a[-1]", r"must return shape \(\.\.\.\).*x\[\.\.\., 0\]"),

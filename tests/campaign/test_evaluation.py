@@ -100,7 +100,7 @@ def test_stage_that_a_run_has_not_changes_nothing(tmp_path: Path) -> None:
     directory = run(compose("mbmf/inverted_pendulum", overrides))
     settings = EvaluationSettings("e", matrix={"policy": ["stochastic"]}, episodes=1).of_a_run()
     before = evaluate_run(str(directory), "e", json.loads(json.dumps(settings))).read_bytes()
-    with pytest.raises(ValueError, match="no stage 'fine_tuning', or not yet; there is shooting"):
+    with pytest.raises(ValueError, match="no stage 'fine_tuning' so far; there is shooting"):
         evaluate_run(str(directory), "e", {**settings, "stage": ["shooting", "fine_tuning"]})
     assert (directory / "evaluations/e.csv").read_bytes() == before
     assert (directory / "evaluations/e.yaml").exists()

@@ -314,7 +314,7 @@ def test_unknown_folders_are_named_before_anything_starts(
     for folders, culprit in [
         ([os.curdir, "nowhere"], "there is no folder nowhere"),
         (["second.yaml"], "there is no folder second.yaml"),
-        ([os.curdir, "seed=3"], "there is no folder seed=3; overrides stand before --reuse"),
+        ([os.curdir, "seed=3"], "there is no folder seed=3; overrides go before --reuse"),
     ]:
         with pytest.raises(SystemExit):
             main(command(file, output, "--reuse", *folders))

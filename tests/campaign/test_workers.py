@@ -119,7 +119,7 @@ def test_good_end_without_the_work_is_a_failure(make_job: MakeJob) -> None:
     ended: list[str] = []
     jobs = [make_job("echo bye", done), make_job("true", lambda: ended.append("next") or [])]
     (failure,) = workers(1).work(jobs)
-    assert str(failure).startswith("echo bye ended well, but it has 3 of 4 iterations")
+    assert str(failure).startswith("echo bye succeeded, but it has 3 of 4 iterations")
     assert ended == ["next"]
 
 

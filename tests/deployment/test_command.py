@@ -126,7 +126,7 @@ def test_no_file_of_the_user_s_is_replaced(name, policy_file, monkeypatch, capsy
     policy = f"{policy_file}:balance"
     arguments = ["robustify", "inverted_pendulum", "--policy", policy, "--output", "."]
     printed = refused(arguments, capsys)
-    assert f"{name} is there already: give another --output" in printed or "move it away" in printed
+    assert f"{name} already exists: give another --output" in printed or "move it away" in printed
     assert Path(name).read_text() == "mine"
 
 

@@ -50,7 +50,7 @@ def test_actions_stay_within_the_bounds(env):
     [
         (lambda x: torch.zeros(7), "expected an action of width 1"),
         (lambda x: x.no_such_thing, "failed at an observation of width 4"),
-        (3, "int is no policy"),
+        (3, "int is not a policy"),
         ("nothing", "unknown policy 'nothing'; policies are sb3"),
         ("math:no_such_name", "no 'no_such_name'"),
     ],
@@ -75,7 +75,7 @@ def test_modules_with_the_weights_of_a_state_dict(env, policy_file, tmp_path):
 
 def test_weights_that_are_pickles_of_objects_are_refused(env, policy_file, tmp_path):
     torch.save(torch.nn.Linear(4, 1), tmp_path / "module.pt")
-    with pytest.raises(ValueError, match="holds more than its tensors"):
+    with pytest.raises(ValueError, match="holds more than tensors"):
         load_policy(f"{policy_file}:network", env, weights=str(tmp_path / "module.pt"))
 
 
@@ -85,7 +85,7 @@ def test_weights_that_are_pickles_of_objects_are_refused(env, policy_file, tmp_p
 def test_weights_that_are_something_else_are_refused(env, policy_file, tmp_path, content):
     file = tmp_path / "weights.pt"
     file.write_bytes(content)
-    with pytest.raises(ValueError, match=r"weights\.pt is no state dict"):
+    with pytest.raises(ValueError, match=r"weights\.pt is not a state dict"):
         load_policy(f"{policy_file}:network", env, weights=str(file))
 
 
@@ -204,7 +204,7 @@ class Integrator:
 
 def test_a_function_that_remembers_or_draws_is_noticed(env):
     for function in (Integrator(), lambda x: torch.randn(*x.shape[:-1], 1)):
-        with pytest.warns(UserWarning, match="another action for the same observation"):
+        with pytest.warns(UserWarning, match="a different action when called again"):
             load_policy(function, env)
 
 
@@ -272,5 +272,5 @@ def test_modules_in_train_mode(env):
 def test_a_policy_with_a_controller_is_refused(env):
     actor = TensorDictModule(balance, ["observation"], ["action"])
     controller = L1Controller(lambda x, u: x * u, dt=0.04, observation_dim=4, action_dim=1)
-    with pytest.raises(ValueError, match="has an L1Controller of its own"):
+    with pytest.raises(ValueError, match="already has an L1Controller"):
         load_policy(TensorDictSequential(actor, controller), env)

@@ -76,7 +76,7 @@ def test_statistics_of_vecnormalize_need_a_word(env, tmp_path):
     model.save(tmp_path / "model.zip")
     normalized.save(tmp_path / "vecnormalize.pkl")
     source = f"sb3:{tmp_path / 'model.zip'}"
-    with pytest.raises(ValueError, match="executes what is in it"):
+    with pytest.raises(ValueError, match="executes its contents"):
         load_policy(source, env)
     raw = actions(load_policy(source, env, normalization="none"), OBSERVATION)
     torch.testing.assert_close(
@@ -110,7 +110,7 @@ def test_statistics_are_found_by_all_their_usual_names(env, tmp_path, monkeypatc
         load_policy(f"sb3:{model}", env)
     (tmp_path / statistics).parent.mkdir(exist_ok=True)
     (tmp_path / statistics).touch()
-    with pytest.raises(ValueError, match=rf"{statistics} stands beside .*, or say 'none'"):
+    with pytest.raises(ValueError, match=rf"{statistics} lies beside .*, or say 'none'"):
         load_policy(f"sb3:{model}", env)
 
 
@@ -119,7 +119,7 @@ def test_of_several_statistics_those_of_the_model_s_steps_are_named(env, tmp_pat
     for steps in (8, 64, 128):
         (tmp_path / f"rl_model_{steps}_steps.zip").touch()
         (tmp_path / f"rl_model_vecnormalize_{steps}_steps.pkl").touch()
-    with pytest.raises(ValueError, match=r"vecnormalize_64_steps\.pkl stands beside"):
+    with pytest.raises(ValueError, match=r"vecnormalize_64_steps\.pkl lies beside"):
         load_policy(f"sb3:{tmp_path / 'rl_model_64_steps.zip'}", env)
 
 

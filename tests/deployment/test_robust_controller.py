@@ -45,7 +45,7 @@ def test_what_is_saved_acts_the_same(robust, policy_file, tmp_path):
     assert torch.equal(first["next", "l1", "u_exec"], second["next", "l1", "u_exec"])
     assert loaded.configs == robust.configs and loaded.preset == robust.preset
     assert load_target(str(tmp_path), trusted=True).configs == robust.configs
-    with pytest.raises(ValueError, match="say --trust, in Python trusted=True, if"):
+    with pytest.raises(ValueError, match=r"give --trust \(trusted=True in Python\) if"):
         load_target(str(tmp_path))
 
 
@@ -162,7 +162,7 @@ def test_what_is_named_is_found_from_any_folder(robust, policy_file, tmp_path, m
 
 def test_objects_are_asked_for_again(robust, tmp_path):
     folder = robust.save(tmp_path)
-    with pytest.raises(ValueError, match="names no policy, which was an object"):
+    with pytest.raises(ValueError, match="does not name the policy, which was an object"):
         RobustController.load(folder)
     assert RobustController.load(folder, policy=balance).configs == robust.configs
     stored = json.loads((folder / "controller.json").read_text())
@@ -231,7 +231,7 @@ def test_what_a_target_has_of_its_own_is_not_given_beside_it(name, tmp_path):
     kept.parent.mkdir()
     kept.touch()
     for target in (tmp_path, kept):
-        with pytest.raises(ValueError, match=f"has a policy of its own: leave --{name} out"):
+        with pytest.raises(ValueError, match=f"has its own policy: leave --{name} out"):
             load_target(str(target), **{name: "none"})
 
 

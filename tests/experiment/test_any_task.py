@@ -265,7 +265,7 @@ def test_code_that_has_changed_since_a_run_began_is_told(
 ) -> None:
     """In the same file, where there is no other folder to compare it with."""
     command = ["run", "mine.yaml", *TINY, "run_dir=r", "--resume"]
-    told = "own.py is not as it was when the run in r began; it is used as it is"
+    told = "own.py has changed since the run in r began; it is used as it is"
     main(command)
     main([*command, "outer_iterations=2"])
     assert told not in "".join(capsys.readouterr())

@@ -95,7 +95,7 @@ def test_what_a_kill_has_come_before_is_kept_when_the_run_goes_on(tiny_recipe: R
 def test_kept_checkpoints_that_cannot_be_used_are_a_line(tiny_recipe: Recipe) -> None:
     run_dir = run(tiny_recipe(*KEEP))
     file = run_dir / "checkpoints" / "after_2.pt"
-    with pytest.raises(RunDirectoryError, match="it is no file"):
+    with pytest.raises(RunDirectoryError, match="it is not a file"):
         load_run(file.with_name("after_9.pt"))
     content = file.read_bytes()
     file.unlink()
@@ -124,7 +124,7 @@ def test_checkpoints_of_other_iterations_are_no_seeds_of_one_training(
     files = [str(first / "after_2.pt"), str(second / "after_1.pt")]
     with pytest.raises(SystemExit):
         main(["evaluate", *files, "--episodes", "1", "--l1", "off"])
-    line = f"{files[0]} is of 2 iterations and {files[1]} of 1; let both get equally far"
+    line = f"{files[0]} is of 2 iterations and {files[1]} of 1; train both equally far"
     assert line in capsys.readouterr().err
     # The best may come at any time.
     (first / "best.pt").unlink()

@@ -85,7 +85,7 @@ def test_what_differs_from_the_checkpoint_is_seen_and_written_again(
     if name == "metrics.csv":
         assert RunDirectory(damaged).iterations_done() < 2
     run(tiny_recipe("resume=true"))
-    assert f"written again from the checkpoint: {name}" in capsys.readouterr().out
+    assert f"rewritten from the checkpoint: {name}" in capsys.readouterr().out
     assert same_files(damaged, whole)
 
 
@@ -151,7 +151,7 @@ def test_the_checkpoint_before_is_used_in_place_of_one_that_cannot_be_read(
     with pytest.raises(RunDirectoryError, match="resume the run"):
         load_run(damaged, last=True)
     assert load_run(damaged).algorithm.iteration == 1
-    assert "checkpoint_previous.pt is used, of 1 iterations" in capsys.readouterr().err
+    assert "checkpoint_previous.pt of 1 iterations is used instead" in capsys.readouterr().err
     run(tiny_recipe("resume=true"))
     lines = [line for line in capsys.readouterr().out.splitlines() if "cannot be read" in line]
     assert len(lines) == 1 and str(file) in lines[0]
@@ -167,7 +167,7 @@ def test_code_in_a_checkpoint_is_not_run(
     for content in (pickle.dumps(harm), saved(harm)):
         (damaged / "checkpoint.pt").write_bytes(content)
         run(tiny_recipe("resume=true"))
-        assert "checkpoint_previous.pt is used" in capsys.readouterr().out
+        assert "checkpoint_previous.pt of" in capsys.readouterr().out
     assert not (tmp_path / "harm").exists()
 
 

@@ -55,7 +55,7 @@ def test_a_minari_dataset_is_read_by_its_folder_too(episodes: list[Episode]) -> 
     assert dataset.spec.env_spec.id == "torchrl_l1/InvertedPendulum-v0"
     assert dataset.observation_space.dtype == dataset.action_space.dtype == np.float32
     (folder / "data" / "metadata.json").write_text("{")
-    with pytest.raises(ValueError, match="no Minari dataset that can be read"):
+    with pytest.raises(ValueError, match="is not a readable Minari dataset"):
         read_dataset(str(folder))
 
 
@@ -93,13 +93,13 @@ def test_what_columns_name_counts_beside_the_usual_names(source: str) -> None:
     assert (read_dataset(source)["observation"] == 0).all()
     for columns, words in {
         "observation=[speed]": "'speed'|no speed, only action, executed, next.l1.u_exec",
-        "action=[torque]": "no torque, only .*: name it, columns.action",
-        "observation=[executed]": "no next.executed, what followed",
+        "action=[torque]": "no torque, only .*: name it with columns.action",
+        "observation=[executed]": "no next.executed, which followed",
         "observation=[state.x]": "'state.x' of shape|no state.x, only [^\n]*$",
         "action=[action.u]": "no action.u, only [^\n]*$",
-        "observation=[state,observation]": "have one observation, not state, observation",
-        "episode=run": "columns.episode is of .csv and .npz files",
-        "time=t": "columns.time is of .csv",
+        "observation=[state,observation]": "has one observation, not state, observation",
+        "episode=run": "columns.episode is only for .csv and .npz files",
+        "time=t": "columns.time is only for .csv",
     }.items():
         key, _, value = columns.partition("=")
         names: Any = value[1:-1].split(",") if value.startswith("[") else value
@@ -145,7 +145,7 @@ def test_of_a_replay_buffer_what_it_holds(storage: type[LazyTensorStorage]) -> N
     found = read_dataset("rb")
     assert found["observation"].flatten().tolist() == [16, 17, 18, 4, 5, *range(1, 16)]
     Path("rb/storage/storage_metadata.json").write_text("{")
-    with pytest.raises(ValueError, match="no tensordict that can be read"):
+    with pytest.raises(ValueError, match="is not a readable tensordict"):
         read_dataset("rb")
 
 
@@ -169,7 +169,7 @@ def test_the_empty_rest_of_a_buffer_s_own_folder_is_told() -> None:
 
 def test_a_table_needs_names() -> None:
     Path("drive.csv").write_text("t,a,b,u\n0,0,0,1\n0.1,1,0,1\n0.2,2,1,0\n")
-    with pytest.raises(ValueError, match="say which columns are what"):
+    with pytest.raises(ValueError, match="name its columns"):
         read_dataset("drive.csv")
     columns = DatasetColumns(["a", "b"], ["u"], time="t")
     assert read_dataset("drive.csv", columns)["next", "observation"].tolist() == [[1, 0], [2, 1]]
@@ -227,13 +227,13 @@ def test_what_is_no_dataset_is_refused_in_one_line(episodes: list[Episode]) -> N
         "": "set dataset=",
         "nowhere": "torchrl-l1 dataset RUN_DIR nowhere makes one",
         "empty": "holds no dataset",
-        "data.txt": "is no dataset: there are .csv",
+        "data.txt": "is not a dataset: use a folder or a file that ends in .csv",
         "torn.npz": "not a readable .npz file",
         "torn.safetensors": "damaged",
         "list.pt": "no dictionary of tensors",
-        "flat.pt": r"with 'observation' of shape \[N, n\]",
+        "flat.pt": r"includes 'observation' of shape \[N, n\]",
         "ragged.pt": "not one row for each of 'observation'",
-        "twice.safetensors": "'next' and 'next.observation' in it: leave one of them out",
+        "twice.safetensors": "holds both 'next' and 'next.observation': leave one of them out",
         "bomb.pt": "cannot be read as plain tensors",
         "pickled": "is a pickle, which is not read",
     }.items():
@@ -353,7 +353,7 @@ def test_what_a_command_refuses(
     Path("there.npz").write_text("")
     for arguments, words in (
         (["nowhere", "a.npz"], "holds no run"),
-        (["nowhere", "there.npz"], "is there already"),
+        (["nowhere", "there.npz"], "already exists"),
     ):
         with pytest.raises(SystemExit):
             main(["dataset", *arguments])

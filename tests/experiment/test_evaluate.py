@@ -151,7 +151,7 @@ def test_a_copy_of_a_run_is_no_second_seed(
     shutil.copytree(directory, tmp_path / "copy")
     with pytest.raises(SystemExit):
         main(["evaluate", str(directory), str(tmp_path / "copy"), "--episodes", "1"])
-    assert "are both of seed 0, one training and no two" in capsys.readouterr().err
+    assert "are both of seed 0, so they are one training" in capsys.readouterr().err
 
 
 def test_cells_share_their_random_numbers_and_see_their_disturbance(tiny_recipe: Recipe) -> None:
@@ -248,8 +248,8 @@ def test_a_suite_ends_in_a_table_of_what_is_recovered(
         (["evaluate", "nowhere", "--epsilon", "1", "-1"], "--epsilon must be finite and not neg"),
         (["evaluate", "nowhere", "--epsilon", "inf"], "--epsilon must be finite and not negative"),
         (["evaluate", "nowhere", "--suite", "loud"], "argument --suite: invalid choice"),
-        (["evaluate", "nowhere", "--suite", "full", "--bias", "1"], "--suite and --bias both say"),
-        (["evaluate", "nowhere", "--suite", "full", "--filmstrip"], "in place of --suite"),
+        (["evaluate", "nowhere", "--suite", "full", "--bias", "1"], "--suite and --bias both set"),
+        (["evaluate", "nowhere", "--suite", "full", "--filmstrip"], "instead of giving --suite"),
         (["evaluate", "nowhere", "--alpha", "0.1", "1.5"], "--alpha must be above 0 and at most 1"),
         (["evaluate", "nowhere", "--alpha", "nan"], "--alpha must be above 0 and at most 1"),
         (["evaluate", "nowhere", "--bias", "0", "inf"], "--bias must be finite, got inf"),

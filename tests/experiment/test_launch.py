@@ -103,7 +103,7 @@ def test_a_campaign_is_data_too(tmp_path: Path) -> None:
         "matrix: {hydra.verbose: [true]}",
     ):
         file.write_text(f"runs: [{{recipe: {PENDULUM}, {entry}}}]\n")
-        with pytest.raises(CampaignError, match="sets up Hydra"):
+        with pytest.raises(CampaignError, match="configures Hydra"):
             read_campaign(str(file))
 
 
@@ -131,10 +131,10 @@ def test_a_key_that_no_schema_knows_is_refused_with_a_plus_too(
         (["l1.epsillon=3"], "there is no key 'l1.epsillon'"),
         (["outer_iterations=many"], "outer_iterations=many"),
         (["l1=louder"], "off paper"),
-        (["l1"], "'l1' is no override: write KEY=VALUE, such as seed=3"),
-        (["--seed", "3"], "'3' is no override: write KEY=VALUE"),
+        (["l1"], "'l1' is not an override: write KEY=VALUE, such as seed=3"),
+        (["--seed", "3"], "'3' is not an override: write KEY=VALUE"),
         (["task=a=b"], "task=a=b: mismatched input '='"),
-        (["task=a=b"], "has quotes of its own: 'task=\"a=b\"'"),
+        (["task=a=b"], "quote a value with such characters: 'task=\"a=b\"'"),
         (["l1=[off"], "[off"),
         (["loggers=wandb"], "(write it as a list, [a,b])"),
         (["seed=0,1"], "Ambiguous value"),
@@ -164,8 +164,8 @@ def test_errors_are_a_line_that_does_not_repeat_the_command(
     [
         ("defaults: [metrpo_recipe\nrecipe: own", "line 2, column"),
         ("recipe: own\ntask inverted", "line 2"),
-        ("- a\n- b\n", "no keys and values"),
-        ("", "no keys and values"),
+        ("- a\n- b\n", "not a mapping of keys to values"),
+        ("", "not a mapping of keys to values"),
         ("recipe: own\ntask: swimmer\n", "has no schema"),
         (OWN + "discont: 3\n", "discont"),
         (OWN + "discount: high\n", "high"),
@@ -175,7 +175,7 @@ def test_errors_are_a_line_that_does_not_repeat_the_command(
             "a: &a [x, x]\n" + "".join(f"a{i}: &a{i} [*a, *a]\n" for i in range(9)) + "b: [\n",
             "line",
         ),
-        ("a: &a [*a]\n", "too large"),
+        ("a: &a [*a]\n", "expand it too far"),
         ("a: !!python/object/apply:os.mkdir [harm]\n" + OWN, "python"),
     ],
 )

@@ -120,7 +120,7 @@ def test_suites_stand_in_place_of_values_and_bring_an_oracle() -> None:
         assert parser.parse_args(["somewhere", *arguments]).l1 == l1
     with pytest.raises(ValueError, match="unknown suite 'all'; there are quick, full"):
         conditions("all")
-    with pytest.raises(ValueError, match="suite and gain both say"):
+    with pytest.raises(ValueError, match="suite and gain both set"):
         conditions("quick", gain=[1.0, 0.5])
 
 

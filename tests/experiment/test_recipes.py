@@ -258,7 +258,7 @@ def test_a_recipe_that_is_called_like_a_schema_is_named(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("defaults: [metrpo/swimmer, _self_]\n")
     (tmp_path / "pets.yaml").write_text("defaults: [pets/half_cheetah, _self_]\n")
     for name in ("metrpo_recipe", "mine"):
-        with pytest.raises(RecipeError, match=r"metrpo_recipe.yaml is called like the schema"):
+        with pytest.raises(RecipeError, match=r"metrpo_recipe.yaml has the name of the schema"):
             compose(str(tmp_path / f"{name}.yaml"))
     assert compose(str(tmp_path / "pets.yaml")).recipe == "pets"
 
@@ -312,7 +312,7 @@ def test_copies_have_names_and_replace_nothing(
     copy = copy_recipe("pets/half_cheetah")
     assert str(copy) == "pets_half_cheetah.yaml"
     copy.write_text("mine")
-    with pytest.raises(RecipeError, match="is there already"):
+    with pytest.raises(RecipeError, match="already exists"):
         copy_recipe("pets/half_cheetah")
     assert copy.read_text() == "mine"
     with pytest.raises(RecipeError, match=r"must end in \.yaml"):
@@ -320,7 +320,7 @@ def test_copies_have_names_and_replace_nothing(
     with pytest.raises(RecipeError, match="Did you mean pets/half_cheetah"):
         copy_recipe("pets/half_cheeta")
     Path("link.yaml").symlink_to("elsewhere.yaml")
-    with pytest.raises(RecipeError, match="is there already"):
+    with pytest.raises(RecipeError, match="already exists"):
         copy_recipe("pets/half_cheetah", "link.yaml")
     campaign = read_campaign(str(copy_recipe("table1_first")))
     assert campaign.to_dict()["runs"] == read_campaign("table1_first").to_dict()["runs"]

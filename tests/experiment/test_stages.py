@@ -124,7 +124,7 @@ def test_stage_not_reached_is_refused_before_any_work(
         with pytest.raises(SystemExit):
             main(["evaluate", str(early), "--stage", *names, "--output", str(output)])
         error = capsys.readouterr().err
-        assert "no stage 'fine_tuning', or not yet; there are shooting, cloning" in error
+        assert "no stage 'fine_tuning' so far; there are shooting, cloning" in error
         assert str(early) in error
     assert not output.exists()
 
@@ -168,7 +168,7 @@ def test_rows_of_a_single_stage_are_as_they_were(tiny_recipe: Recipe) -> None:
     cell = Condition("off")
     (row,) = evaluate(loaded, [cell], 2)
     assert "stage" not in row
-    with pytest.raises(ValueError, match="no stage 'shooting', or not yet; there is policy"):
+    with pytest.raises(ValueError, match="no stage 'shooting' so far; there is policy"):
         next(evaluate(loaded, [replace(cell, stage="shooting")], 2))
 
 

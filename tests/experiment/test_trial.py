@@ -95,10 +95,10 @@ def test_a_new_recipe_composes_and_needs_no_fix(
     said = capsys.readouterr().out
     assert "fix" not in said.replace("nothing to fix", "")
     assert said.endswith("torchrl-l1 run swing.yaml seed=1 horizon=100\n")
-    assert "the reward function gives the environment's rewards" in said
+    assert "the reward function reproduces the environment's rewards" in said
     with pytest.raises(SystemExit):
         main(["new-task", "swing.yaml", "--from", "gymnasium/Pendulum-v1"])
-    assert "exists already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
 
 
 def test_a_new_recipe_and_its_environment_may_have_any_path(
@@ -124,7 +124,7 @@ def test_all_that_is_odd_is_named(place: Path, capsys: pytest.CaptureFixture[str
         "entries [2] of the observation never change",
         "the same seed does not give the same episodes",
         "the reward function explains",
-        "correct it, or say reward=learned",
+        "correct it, or set reward=learned",
         "steps are called terminal",
         "entries [1] are hardly predicted",
         "things to fix",

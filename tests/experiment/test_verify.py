@@ -117,7 +117,7 @@ def test_bad_traces_are_named(tmp_path):
         verify_traces(write(path, a__b=trace | {"dt": np.array(0.0)}))
     with pytest.raises(ValueError, match="no steps"):
         verify_traces(write(path, a__b={k: v[:0] if v.ndim else v for k, v in trace.items()}))
-    with pytest.raises(ValueError, match="values that are no numbers"):
+    with pytest.raises(ValueError, match="values that are not numbers"):
         verify_traces(write(path, a__b=trace | {"u": np.full((30, 2), "x")}))
     with pytest.raises(ValueError, match="cannot read a/b/u"):
         verify_traces(write(path, a__b=trace | {"u": np.full((30, 2), None)}))

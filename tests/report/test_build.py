@@ -107,7 +107,7 @@ def test_report_joins_tables_and_figures(campaign: Path, tmp_path: Path) -> None
         assert f"\n## {heading}\n" in text
     assert "10 runs, of which 9 are finished" in text
     assert "seed 3: 2 of 5 iterations" in text
-    assert "9 of 21 runs finished, 12 not begun, 1 here that it does not ask for" in text
+    assert "9 of 21 runs finished, 12 not begun, 1 others in its folder" in text
     assert f"$ torchrl-l1 campaign figure2 --output {campaign}\n" in text
     assert f"--reference-curves {curves}\n" in text
     assert "| torch | 2.13.0 | 10 |" in text
@@ -341,8 +341,8 @@ def test_every_file_that_cannot_be_read_is_listed(write_run: WriteRun, tmp_path:
         strict=True,
     ):
         assert f"{run}/{words}" in text
-    assert "aliases that make it too large" in text
-    assert "is no campaign file" in text
+    assert "aliases that expand it too far" in text
+    assert "is not a campaign file" in text
 
 
 def test_text_from_files_is_text(write_run: WriteRun, tmp_path: Path) -> None:

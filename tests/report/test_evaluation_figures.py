@@ -282,6 +282,6 @@ def test_report_shows_the_sweep_in_its_section(
     picture = "sweep_tolerance_inverted_pendulum_none_off.png"
     actions = {"stochastic": "sampled actions", "deterministic": "mean action"}[policy]
     assert f"L1 off; tested with {actions}]({picture})" in section
-    assert "dashed, the same policies without L1" in section
+    assert "dashed: the same policies without L1" in section
     assert "| paper | 0.1 |" in section
     assert [file.name for file in page.parent.glob("sweep_*")] == [picture]

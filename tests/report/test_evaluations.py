@@ -125,7 +125,10 @@ def test_a_page_tells_where_policies_of_a_row_had_other_episodes(
         run = write_run([1.0], "l1=off", seed=seed, evaluations={"mine": tests})
         (run / "evaluations/mine.yaml").write_text(f"{{iterations: 1, seed: {start}}}")
     page = report([tmp_path / "runs"])
-    told = "In 1 of 1 rows of the CSV policies were tested over other episodes" in page.read_text()
+    told = (
+        "In 1 of 1 rows of the CSV, policies were tested over different episodes"
+        in page.read_text()
+    )
     assert told == ((episodes, drawn) != (25, 0))
     with (page.parent / "mine.csv").open() as file:
         (row,) = csv.DictReader(file)

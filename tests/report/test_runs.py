@@ -117,7 +117,7 @@ def test_what_a_table_repeats_counts_once(write_run: WriteRun, tmp_path: Path) -
     assert test.returns == (0.0, -1.0)
     assert not found.runs[1].evaluations
     (error,) = found.errors
-    assert "episodes/mine.csv, line 4: what it says of L1 paper" in str(error)
+    assert "episodes/mine.csv, line 4: its values for L1 paper" in str(error)
 
 
 def test_a_return_of_no_number_costs_its_own_row_of_an_evaluation(
@@ -165,7 +165,7 @@ def test_an_evaluation_of_before_the_run_has_gone_on_is_left_out(
     assert set(found.runs[0].evaluations) == {"now", "damaged", "older"}
     (error,) = found.errors
     assert str(run / "evaluations" / "then.csv") in str(error)
-    assert "made after 2 iterations, and the run has 3" in str(error)
+    assert "made after 2 iterations, but the run has 3" in str(error)
 
 
 def test_what_cannot_be_read_is_left_out_and_the_rest_stays(
@@ -239,4 +239,6 @@ def test_episodes_of_another_evaluation_are_told(write_run: WriteRun, tmp_path: 
     assert [len(run.evaluations.get("mine", ())) for run in found.runs] == [1, 0, 0]
     assert len(found.errors) == 2
     for run, error in zip(found.runs[1:], found.errors, strict=True):
-        assert str(error).startswith(f"{run.path / 'evaluations/episodes/mine.csv'} is not of ")
+        assert str(error).startswith(
+            f"{run.path / 'evaluations/episodes/mine.csv'} does not belong to "
+        )

@@ -1,4 +1,4 @@
-"""What every algorithm is to those who run, save and evaluate it."""
+"""The common interface of algorithms: running, saving and evaluating them."""
 
 from __future__ import annotations
 
@@ -32,37 +32,37 @@ from torchrl_l1.envs import AnyTask, BadAction, Perturbation, get_task
 _Module = TypeVar("_Module", bound=nn.Module)
 
 DEVICES = ("cpu", "cuda", "auto")
-"""Where models may be fitted and trajectories imagined."""
+"""Devices on which models may be fitted and trajectories imagined."""
 
 
 def resolve_device(name: str) -> torch.device:
-    """``auto`` is CUDA where there is one; a device that is not there is a ``ValueError``."""
+    """The device; ``auto`` is CUDA if available. A missing device is a ``ValueError``."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name not in DEVICES:
         raise ValueError(f"device must be {' or '.join(DEVICES)}, got {name!r}")
     device = torch.device(name)
     if device.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError("device=cuda was asked for, but torch finds no CUDA device; use cpu")
+        raise ValueError("device=cuda was requested, but torch finds no CUDA device; use cpu")
     return device
 
 
 COMMON_METRICS: dict[str, str] = {
     "iteration": "Outer iteration, from 0.",
-    "real_steps": "Real environment steps so far, the initial random ones included.",
+    "real_steps": "Real environment steps so far, including the initial random ones.",
     **RETURN_METRICS,
     **FIT_METRICS,
     **OUTCOME_METRICS,
 }
-"""What every algorithm logs."""
+"""Metrics that every algorithm logs."""
 
 
 class Diverged(ValueError):
-    """Something has become infinite or no number at all that training cannot go on from.
+    """A value that training cannot continue from has become infinite or NaN.
 
     Attributes:
-        iteration: the outer iteration in which that happened.
-        may_go_on: whether ``on_divergence=warn`` would have gone on.
+        iteration: the outer iteration in which this happened.
+        may_go_on: whether ``on_divergence=warn`` would have continued.
     """
 
     def __init__(
@@ -75,11 +75,11 @@ class Diverged(ValueError):
         self.may_go_on = may_go_on
 
 
-# Transitions that a model has to predict in numbers.
+# Number of transitions for which predictions must be finite.
 _PROBED = 64
 
-# What is finite in every round of a training that goes well, and the settings behind it if not: of
-# all algorithms, by the beginnings of their metrics' names.
+# Metrics of all algorithms, by prefix, that are finite in every round of a healthy training, and
+# the settings to look at otherwise.
 _FINITE = {
     "model/": "fit.learning_rate, model.std_floor and the data's scale",
     "reward_model/": "fit.learning_rate, model.std_floor and the rewards' scale",
@@ -96,12 +96,12 @@ _FINITE = {
 
 @dataclass
 class IterationResult:
-    """What an outer iteration reports.
+    """The result of an outer iteration.
 
     Attributes:
-        metrics: by name.
+        metrics: metrics by name.
         seconds: wall-clock time by phase.
-        diverged: what went wrong in it, where the algorithm goes on all the same, see
+        diverged: what went wrong in it, if the algorithm continues all the same, see
             :class:`Algorithm`.
     """
 
@@ -111,7 +111,7 @@ class IterationResult:
 
 
 class AlgorithmConfig(Protocol):
-    """What the settings of all algorithms have in common."""
+    """Settings common to all algorithms."""
 
     outer_iterations: int
     label: str
@@ -120,11 +120,11 @@ class AlgorithmConfig(Protocol):
 
     @property
     def episode_steps(self) -> int | None:
-        """Steps of a collected episode; a full one's if `None`."""
+        """Steps of a collected episode; those of a full one if `None`."""
 
 
 class Surroundings(TypedDict, total=False):
-    """What an algorithm takes beside its settings, see :class:`Algorithm`."""
+    """Arguments of an algorithm besides its settings, see :class:`Algorithm`."""
 
     seed: int
     horizon: int | None
@@ -138,44 +138,44 @@ class Surroundings(TypedDict, total=False):
 
 
 class Algorithm(ABC):
-    """What model-based algorithms share: task, model, data, random streams, phases, state.
+    """Base of model-based algorithms: task, model, data, random streams, phases and state.
 
-    A loop goes over :meth:`rounds`, does its work in :meth:`phase` after phase, and yields what
-    :meth:`complete` makes of each round. A subclass sets ``learning``, for it knows how many real
-    steps there will be, and says what acts (:attr:`policies`).
+    A loop goes over :meth:`rounds`, does its work in one :meth:`phase` after another, and yields
+    the result of :meth:`complete` for each round. A subclass sets ``learning``, since it knows the
+    number of real steps, and provides what acts (:attr:`policies`).
 
     Args:
         task: a task, or its name, see :func:`torchrl_l1.envs.get_task`.
         config: settings.
         l1: the adaptive controller of real environments; ``None`` for none.
         perturbation: noise and disturbances of the real environments.
-        seed: seed of every random stream. Streams are derived anew from the seed and the
-            iteration's number, so that a resumed run draws what an unbroken one would have.
+        seed: seed of every random stream. Streams are derived from the seed and the number of the
+            iteration, so that a resumed run draws the same numbers as an uninterrupted one.
         horizon: steps per full real episode; the task's own by default.
-        device: where models are fitted, trajectories imagined and plans made: ``cpu``, ``cuda`` or
+        device: device for fitting models, imagining trajectories and planning: ``cpu``, ``cuda`` or
             ``auto``. Real environments, and copies of what acts in them, are on the CPU.
         compile_l1: whether to compile the controller's step, see
             :class:`~torchrl_l1.control.L1Transform`.
-        on_phase: called with a word on what is going on, for progress bars.
-        reward: of imagined trajectories, see :class:`~torchrl_l1.algorithms.Outcomes`.
-        termination: likewise.
-        outcome_model: of a learned reward and a learned termination.
+        on_phase: called with a description of the current work, for progress bars.
+        reward: reward of imagined trajectories, see :class:`~torchrl_l1.algorithms.Outcomes`.
+        termination: termination of imagined trajectories, likewise.
+        outcome_model: settings of a learned reward and a learned termination.
         search_path: folders for files and modules that reward and termination name.
 
     Attributes:
-        facts: what is known of the algorithm without running it.
-        policy_settings: settings to look at where a policy gives no numbers.
+        facts: what is known about the algorithm without running it.
+        policy_settings: settings to look at if a policy returns non-finite actions.
         config_class: the class of its settings.
-        iteration: outer iterations that are complete.
-        stops_on_divergence: whether to raise :class:`Diverged` where something is no longer
+        iteration: number of completed outer iterations.
+        stops_on_divergence: whether to raise :class:`Diverged` when something is no longer
             finite, or to note it in the result of the iteration.
         dynamics: the model.
         acting_dynamics: the model that L1 uses in real environments, on the CPU.
-        outcomes: rewards and ends of what is imagined.
+        outcomes: rewards and terminations of imagined trajectories.
         learning: the model's data and fits.
         real: makes real environments, see :class:`~torchrl_l1.algorithms.collection.Collection`.
         horizon: steps per full real episode.
-        episode_steps: steps of a collected one.
+        episode_steps: steps of a collected episode.
     """
 
     facts: ClassVar[AlgorithmFacts]
@@ -242,33 +242,33 @@ class Algorithm(ABC):
         )
 
     def _on_cpu(self, module: _Module) -> _Module:
-        """What acts in real environments: the module, or a copy where it is on another device."""
+        """The module that acts in real environments: itself, or a copy if on another device."""
         return module if self.device.type == "cpu" else deepcopy(module).cpu()
 
     def make_learning(self, capacity: int) -> ModelLearning:
-        """Data with room for so many real transitions, and the fits of the model to them."""
+        """Data with the given capacity of real transitions, and fits of the model to them."""
         fit, label = self.config.fit, self.config.label
         terminations = self.outcomes.learns_terminations
         return ModelLearning(self.dynamics, fit, label, capacity, terminations)
 
     @abstractmethod
     def iterate(self) -> Iterator[IterationResult]:
-        """Run the outer iterations that are left, reporting after each."""
+        """Run the remaining outer iterations, reporting after each."""
 
     def prepare(self) -> None:  # noqa: B027, most algorithms need nothing
-        """Read what is needed from elsewhere, and refuse what is of no use, before work starts."""
+        """Read external data, and refuse unusable ones, before work starts."""
 
     @property
     @abstractmethod
     def policies(self) -> Mapping[str, TensorDictModuleBase]:
-        """What acts in real environments, by the names of the stages that they come from.
+        """The policies that act in real environments, by the stage that they come from.
 
-        In the order in which they come about, and only what has been learned so far; the last one
-        is the algorithm's result.
+        In the order of their stages, and only those learned so far; the last one is the algorithm's
+        result.
         """
 
     def rounds(self) -> Iterator[int]:
-        """The outer iterations that are left, each on random streams and a clock of its own."""
+        """The remaining outer iterations, each with its own random streams and clock."""
         while self.iteration < self.config.outer_iterations:
             seed_streams(self.seed, "iteration", self.iteration)
             self._seconds = dict.fromkeys(self.facts.phases, 0.0)
@@ -279,14 +279,14 @@ class Algorithm(ABC):
 
     @contextmanager
     def phase(self, name: str, words: str = "") -> Iterator[None]:
-        """Measure a phase of an outer iteration, and say that it has begun.
+        """Measure a phase of an outer iteration, and report that it has begun.
 
         Args:
             name: one of ``facts.phases``.
-            words: on what is going on; those of the phase by default.
+            words: description of the work; that of the phase by default.
 
         Raises:
-            Diverged: if a policy acts that gives no numbers, whatever is to be done otherwise.
+            Diverged: if a policy returns non-finite actions, even with ``on_divergence=warn``.
         """
         self._phase = self.facts.phases[name].words
         self.on_phase(words or self._phase)
@@ -311,7 +311,7 @@ class Algorithm(ABC):
         return {**fit_metrics(report), **learned}
 
     def _fit_outcomes(self) -> dict[str, float]:
-        """Fit what is learned of rewards and terminations, to the same data as the model."""
+        """Fit learned rewards and terminations to the same data as the model."""
         if not self.outcomes.models:
             return {}
         self.on_phase(f"fit, {' and '.join(self.outcomes.models).replace('_model', '')}")
@@ -322,7 +322,7 @@ class Algorithm(ABC):
         return metrics
 
     def _calibrate_filter(self) -> None:
-        """Where a Kalman filter acts, fit it to what the model misses now."""
+        """If a Kalman filter acts, calibrate it on the current errors of the model."""
         if self.l1 is None or not self.l1.needs_calibration:
             return
         residuals = self.acting_dynamics.residuals
@@ -340,11 +340,11 @@ class Algorithm(ABC):
         self.dynamics.residuals.load_state_dict(residuals.state_dict())
 
     def diverged(self, what: str, setting: str) -> None:
-        """Stop the training, or note it and go on, see ``stops_on_divergence``.
+        """Stop the training, or note the problem and continue, see ``stops_on_divergence``.
 
         Args:
-            what: has happened.
-            setting: that is likely to be the cause.
+            what: what has happened.
+            setting: the setting that is the likely cause.
 
         Raises:
             Diverged: if the training stops.
@@ -352,7 +352,7 @@ class Algorithm(ABC):
         error = Diverged(self.iteration, self._phase, what, setting)
         if self.stops_on_divergence:
             raise error
-        # What a phase has noted need not be said again at the end of the iteration.
+        # What a phase has noted is not repeated at the end of the iteration.
         if not any(f": {what}; " in str(noted) for noted in self._diverged):
             self._diverged.append(error)
 
@@ -368,7 +368,7 @@ class Algorithm(ABC):
             self.diverged(f"weights of the {name} are not finite", setting)
 
     def _check_predictions(self) -> None:
-        """Weights may be finite and their products not, and imagination go on along its bounds."""
+        """Weights may be finite but predictions not, while imagination moves along its bounds."""
         data = self.learning.buffer[:][:_PROBED].to(self.device)
         with torch.no_grad():
             action = data[self.learning.action_key]
@@ -377,10 +377,10 @@ class Algorithm(ABC):
             self.diverged("predictions of the model are not finite", _FINITE["model/"])
 
     def check_plans(self, data: TensorDictBase) -> None:
-        """Note it where no plan from a finite observation had a finite return.
+        """Report divergence if a plan from a finite observation had no finite return.
 
         Args:
-            data: collected by a planner, see ``ModelPredictiveController``.
+            data: data collected by a planner, see ``ModelPredictiveController``.
         """
         plan = data["next", "plan", "best_return"].squeeze(-1)
         lost = ~plan.isfinite() & data["observation"].isfinite().all(-1)
@@ -395,12 +395,12 @@ class Algorithm(ABC):
         """End the outer iteration.
 
         Args:
-            real_steps: so far, in all.
-            metrics: those of ``facts.metrics`` but for the first two; those who run and report an
-                algorithm need ``return_mean`` and ``return_deterministic`` of every iteration.
+            real_steps: total number so far.
+            metrics: those of ``facts.metrics`` except the first two; runs and reports need
+                ``return_mean`` and ``return_deterministic`` of every iteration.
 
         Raises:
-            Diverged: if a metric is not finite that should be.
+            Diverged: if a metric that should be finite is not.
         """
         self._check_finite(metrics)
         head = {"iteration": self.iteration, "real_steps": real_steps}
@@ -408,18 +408,18 @@ class Algorithm(ABC):
         return IterationResult({**head, **metrics}, self._seconds, self._diverged)
 
     def choices(self) -> dict[str, str]:
-        """What settings that say ``auto`` have become on this machine."""
+        """The values that ``auto`` settings have taken on this machine."""
         fit = model_precision(self.dynamics, self.config.fit.precision)
         return {"device": str(self.device), "fit": fit}
 
     def weights(self) -> dict[str, dict[str, Any]]:
-        """State dicts of what has been learned, by the names under which users look for them."""
+        """State dicts of what has been learned, by the names of their files."""
         return {"model": self.dynamics.state_dict(), **self.outcomes.weights()}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue, as plain tensors and numbers.
 
-        They are those in use, as in torch: ``copy.deepcopy`` what is to stay while this goes on.
+        As in torch, they are references: use ``copy.deepcopy`` for a snapshot.
         """
         state = {"iteration": self.iteration, **self.learning.state_dict()}
         learned = self.outcomes.state_dict()

@@ -1,4 +1,4 @@
-"""Behaviour cloning: a policy network learns to act as a planner does."""
+"""Behaviour cloning: a policy network learns to imitate a planner."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from torchrl_l1.dynamics.transitions import split_validation
 CLONING_METRICS: dict[str, str] = {
     "clone/train_loss": "Stage 2: mean squared difference between the policy's and the planner's "
     "actions in the last epoch, in halves of the action range.",
-    "clone/validation_loss": "Stage 2: the same on the states kept out of training, for the "
-    "weights kept. Random shooting is noisy: what its actions scatter is left here.",
+    "clone/validation_loss": "Stage 2: the same on the states held out of training, for the "
+    "weights kept. Random shooting is noisy: the scatter of its actions remains here.",
     "clone/epochs": "Stage 2: passes over the labelled states.",
     "clone/states": "Stage 2: labelled states so far.",
 }
-"""What a round of cloning reports."""
+"""Metrics of a round of cloning."""
 
 
 class CloningSettings(Protocol):
@@ -61,17 +61,17 @@ class CloningReport:
 
 
 class Cloning:
-    """States, the actions that an expert takes in them, and the fits of a policy to both.
+    """States, an expert's actions in them, and the fits of a policy to both.
 
     The loss is the squared error of the policy's mean action, in halves of the action range,
     averaged over the entries of the action: that of DAgger (arXiv 1011.0686) for continuous
-    actions, as arXiv 1708.02596 (section V) has it. The standard deviation is not fitted.
+    actions, as in arXiv 1708.02596 (section V). The standard deviation is not fitted.
 
     Args:
         policy: changed in place.
         config: how it is fitted.
         half_range: half the range of the actions, one number or one for each entry.
-        capacity: states that there is room for.
+        capacity: maximum number of states.
         normalize: whether each fit takes the statistics of the policy's inputs from the states
             that it trains on.
     """
@@ -92,7 +92,7 @@ class Cloning:
     def store(self, observation: Tensor, action: Tensor) -> None:
         """Add states ``(B, n)`` with the expert's actions ``(B, m)``, where both are finite.
 
-        A fixed share of them is kept out of training for good.
+        A fixed share of them is permanently held out of training.
         """
         finite = torch.isfinite(observation).all(-1) & torch.isfinite(action).all(-1)
         self.data.extend(
@@ -103,9 +103,9 @@ class Cloning:
         )
 
     def fit(self, on_epoch: Callable[[int], None] | None = None) -> CloningReport:
-        """Fit the policy to all pairs so far, from the weights that it has.
+        """Fit the policy to all pairs so far, starting from its current weights.
 
-        The weights kept are those of the epoch with the lowest validation loss.
+        The weights of the epoch with the lowest validation loss are kept.
 
         Raises:
             ValueError: if there is nothing to train or to validate on.
@@ -156,5 +156,5 @@ class Cloning:
         return {"pairs": self.data.state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from :meth:`state_dict`; other entries of ``state`` do not matter."""
+        """Continue from :meth:`state_dict`; other entries of ``state`` are ignored."""
         self.data.load(state["pairs"])

@@ -1,4 +1,4 @@
-"""Real data: the environment with its perturbations, with L1 or without, and random streams."""
+"""Real data: the perturbed environment, with or without L1, and random streams."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ RETURN_METRICS: dict[str, str] = {
     "return_deterministic": "Mean return of full real episodes with mean actions.",
     "episodes": "Number of episodes behind `return_mean`.",
     "non_finite_steps": "Real steps on which the simulator's state, the observation or the reward "
-    "became non-finite; they end the episode and are kept out of the data.",
+    "became non-finite; they end the episode and are left out of the data.",
 }
-"""What the episodes of a round show, whatever collected them."""
+"""Metrics of the episodes of a round, whatever collected them."""
 
 L1_METRICS: dict[str, str] = {
     "l1/switch_rate": "Switches of the operating point per real step; about 1 with a Kalman "
@@ -48,11 +48,11 @@ L1_METRICS: dict[str, str] = {
     "l1/unmatched_max": "Largest such norm.",
     "l1/u_a": "Mean norm of the adaptive input, action units.",
     "l1/u_a_max": "Largest such norm.",
-    "l1/saturation": "Share of action entries that a bound cut.",
+    "l1/saturation": "Share of action entries cut by a bound.",
     "l1/ill_conditioned": "Share of steps with a rank-deficient or ill-conditioned Jacobian.",
-    "l1/non_finite": "Steps on which an input of L1 was not finite and it stood aside.",
+    "l1/non_finite": "Steps on which an input of L1 was not finite, so that L1 did not act.",
 }
-"""What the adaptive controller did in them; only with L1 on."""
+"""Metrics of the adaptive controller in these episodes; only with L1 on."""
 
 _L1_MEANS = {
     "switch": "switch_rate",
@@ -62,7 +62,7 @@ _L1_MEANS = {
 _L1_MEANS_AND_MAXIMA = ("affinization_error", "prediction_error", "matched", "unmatched", "u_a")
 
 ORACLE: Literal["oracle"] = "oracle"
-"""In place of L1's settings: the oracle, which is told the matched disturbances."""
+"""Stands for the oracle, which is told the matched disturbances, instead of L1's settings."""
 
 
 def make_pipeline(
@@ -77,9 +77,9 @@ def make_pipeline(
 ) -> TransformedEnv:
     """The perturbed environment, augmented by L1 unless ``l1`` is ``None``, and ``extra``.
 
-    The order matters: on its way in, an action meets L1 first and the noise last; on its way
+    The order matters: on its way in, an action passes L1 first and the noise last; on its way
     out, an observation is noisy before L1 sees it. With :data:`ORACLE`, an
-    :class:`~torchrl_l1.control.OracleTransform` stands in L1's place.
+    :class:`~torchrl_l1.control.OracleTransform` replaces L1.
     """
     controller: list[Transform] = []
     if isinstance(l1, L1Config):
@@ -102,19 +102,19 @@ class Collection:
     steps. Every call starts from a fresh reset and a fresh seed, so that no state outlives it.
 
     Args:
-        task: what the environments are of.
-        episodes: how many.
-        policy: what acts.
+        task: the task of the environments.
+        episodes: number of episodes.
+        policy: the policy that acts.
         dynamics: the model that L1 uses.
         l1: the controller; ``None`` for none, or :data:`ORACLE`.
         perturbation: noise and disturbances.
-        horizon: steps of each; the task's own if ``None``.
+        horizon: steps per episode; the task's own if ``None``.
         compile_l1: whether to compile the controller's step.
 
     Attributes:
         horizon: steps of an episode.
-        frames: steps of all episodes together.
-        env: with the perturbation, L1 and what the policy needs.
+        frames: total number of steps of all episodes.
+        env: the environment with perturbation, L1 and what the policy needs.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class Collection:
         self.horizon = horizon or task.horizon
         self.frames = episodes * self.horizon
         self.policy = policy
-        # A policy with a memory brings the transform that keeps it.
+        # A policy with a memory provides the transform that keeps it.
         primer = getattr(policy, "make_tensordict_primer", None)
         extra = [] if primer is None else [primer()]
         self.env = make_pipeline(
@@ -143,7 +143,7 @@ class Collection:
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        # A running iterator cannot be copied, and needs not be: each call starts afresh.
+        # A running iterator cannot be copied, and need not be: each call starts afresh.
         return {name: part for name, part in vars(self).items() if name != "_policy_batches"}
 
     @cached_property
@@ -159,7 +159,7 @@ class Collection:
             frames_per_batch=self.frames,
             total_frames=-1,
             reset_at_each_iter=True,
-            # Otherwise every entry is checked for its device, twice a step.
+            # Otherwise the device of every entry is checked twice per step.
             device=env.device,
             trust_policy=True,
             track_traj_ids=False,
@@ -169,7 +169,7 @@ class Collection:
         return iter(collector)
 
     def random(self, seed: int, bounds: tuple[Tensor, Tensor] | None = None) -> TensorDictBase:
-        """Episodes ``[N, T]`` of actions uniform between ``bounds``; those of the task if none."""
+        """Episodes ``[N, T]`` of actions uniform between ``bounds``, by default the task's."""
         env = self._bare_env()
         spec = env.full_action_spec
         if bounds is not None:
@@ -193,9 +193,9 @@ class Collection:
         steps: int | None = None,
         callback: Callable[[EnvBase, TensorDictBase], object] | None = None,
     ) -> TensorDictBase:
-        """As many extra episodes ``[N, T]``, of the policy's mean or sampled actions.
+        """As many extra episodes ``[N, T]``, with the policy's mean or sampled actions.
 
-        One episode per environment; the rows of those that end early repeat their last step, see
+        One episode per environment; rows that end early repeat their last step, see
         :func:`first_episodes`.
 
         ``callback`` is called after every step with the environment and the data so far.
@@ -225,7 +225,7 @@ def return_metrics(data: TensorDictBase) -> dict[str, float]:
 
 
 def returns_of_one_way(data: TensorDictBase) -> dict[str, float]:
-    """Returns of what acts the same with sampled and with mean actions."""
+    """Returns of a policy whose sampled and mean actions are the same."""
     deterministic = episode_returns(data).mean().item()
     return {**return_metrics(data), "return_deterministic": deterministic}
 
@@ -235,14 +235,14 @@ def policy_returns(
 ) -> dict[str, float]:
     """Returns of full episodes: with sampled actions and with the policy's mean action.
 
-    Where the collected episodes are full, they are the ones with sampled actions.
+    If the collected episodes are full, they are used for the sampled actions.
 
     Args:
         data: episodes of ``collected``, of the stochastic policy.
-        collected: where they come from.
-        measured: full episodes of the same policy.
-        seed: of the measured episodes' streams.
-        iteration: likewise.
+        collected: the collection that they come from.
+        measured: collection of full episodes of the same policy.
+        seed: seed for the streams of the measured episodes.
+        iteration: iteration for these streams.
     """
     shorter = collected.horizon < measured.horizon
     full = not shorter and not data["next", "terminated"].any()
@@ -268,8 +268,8 @@ def signal_metrics(data: TensorDictBase) -> dict[str, float]:
 def episode_returns(data: TensorDictBase) -> Tensor:
     """Undiscounted return of the first episode of every environment in ``[N, T]``: ``(N,)``.
 
-    Where episodes end early, others may follow in the same row. They are no fair sample: those that
-    the end of the data cuts off are the long ones.
+    If episodes end early, others may follow in the same row. They would be a biased sample: the end
+    of the data cuts off the long ones.
     """
     done = data["next", "done"].squeeze(-1)
     first = done & (done.cumsum(1) == 1)
@@ -283,13 +283,13 @@ def episode_lengths(data: TensorDictBase) -> Tensor:
 
 
 def first_episodes(data: TensorDictBase) -> TensorDictBase:
-    """The steps of the first episode of every environment in ``[N, T]``, in one row."""
+    """The steps of the first episode of every environment in ``[N, T]``, as one row."""
     done = data["next", "done"].squeeze(-1)
     return data[done.cumsum(1) - done.long() == 0]
 
 
 def stream_seed(seed: int, *names: str | int) -> int:
-    """A 63-bit seed for the stream of that name.
+    """A 63-bit seed for the stream with this name.
 
     Examples:
         >>> stream_seed(0, "iteration", 3) == stream_seed(0, "iteration", 3)
@@ -302,7 +302,7 @@ def stream_seed(seed: int, *names: str | int) -> int:
 
 
 def seed_streams(seed: int, *names: str | int) -> None:
-    """Start torch's global generator on the stream of that name."""
+    """Start torch's global generator on the stream with this name."""
     torch.manual_seed(stream_seed(seed, *names))
 
 
@@ -312,6 +312,6 @@ def _with_executed(data: TensorDictBase) -> TensorDictBase:
 
 
 def _seed(env: EnvBase, seed: int, *names: str | int) -> None:
-    """Start the resets and torch's global generator on a stream that nothing before touched."""
+    """Start the resets and torch's global generator on an unused stream."""
     env.set_seed(stream_seed(seed, *names) % 2**31)
     seed_streams(seed, *names)

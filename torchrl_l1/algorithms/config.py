@@ -1,4 +1,4 @@
-"""Settings that algorithms share."""
+"""Settings shared by algorithms."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from torchrl_l1.dynamics.ensemble import ACTIVATIONS
 from torchrl_l1.planning import TrajectorySampler, check_sampling, resolve_compilation
 
 LABELS: Mapping[str, str] = {"nominal": "action", "executed": "executed"}
-"""What ``label`` may be, with the key of the action that the model is then fitted to."""
+"""Values of ``label``, with the key of the action that the model is fitted to."""
 
 
 class PlanSettings(Protocol):
-    """What the settings of algorithms that plan have in common."""
+    """Settings common to algorithms that plan."""
 
     particles: int
     propagation: str
@@ -40,13 +40,14 @@ def make_sampler(
     outcomes: Outcomes,
     **more: Any,
 ) -> TrajectorySampler:
-    """What values plans, as an algorithm's settings say.
+    """The evaluator of plans according to an algorithm's settings.
 
     Args:
-        settings: those of the algorithm.
+        settings: settings of the algorithm.
         dynamics: the model.
-        outcomes: for reward and termination.
-        **more: what only some algorithms set of :class:`~torchrl_l1.planning.TrajectorySampler`.
+        outcomes: reward and termination.
+        **more: arguments of :class:`~torchrl_l1.planning.TrajectorySampler` that only some
+            algorithms set.
     """
     return TrajectorySampler(
         dynamics,
@@ -61,12 +62,12 @@ def make_sampler(
 
 
 def check_planning(settings: PlanSettings, optimizer: str, horizon: int) -> None:
-    """Refuse settings of a planner that make no sense, with a ``ValueError``.
+    """Refuse invalid settings of a planner with a ``ValueError``.
 
     Args:
-        settings: those of the algorithm.
+        settings: settings of the algorithm.
         optimizer: name of the settings that hold the horizon.
-        horizon: actions in a plan.
+        horizon: number of actions in a plan.
     """
     check_sampling(settings.particles, settings.propagation, settings.precision)
     check_count("replan_every", settings.replan_every)
@@ -81,12 +82,12 @@ def check_planning(settings: PlanSettings, optimizer: str, horizon: int) -> None
 
 
 def check_covariance(l1: L1Config | None, model: ModelConfig, elites: int | None) -> None:
-    """Refuse a covariance of residuals that a model does not tell.
+    """Refuse a covariance of residuals that a model does not provide.
 
     Args:
         l1: the controller; ``None`` for none.
         model: settings of the model.
-        elites: how many of its members count; all of them if ``None``.
+        elites: number of members used; all if ``None``.
 
     Raises:
         ValueError: naming the setting of the model.
@@ -108,7 +109,7 @@ def check_covariance(l1: L1Config | None, model: ModelConfig, elites: int | None
 
 
 def episode_length(asked: int | None, horizon: int) -> int:
-    """Steps of an episode: those asked for, and no more than a full one has.
+    """Steps of an episode: as requested, but at most those of a full one.
 
     Examples:
         >>> episode_length(None, 100), episode_length(30, 100), episode_length(300, 100)
@@ -128,7 +129,7 @@ class ModelConfig:
         hidden: widths of a nonlinear network's hidden layers; for the control-affine form they
             are scaled to the same number of parameters.
         activation: ``relu``, ``tanh`` or ``silu``.
-        std_floor: smallest standard deviation of the normalisers, raw units.
+        std_floor: smallest standard deviation of the normalisers, in raw units.
         box_margin: widening of the box around the data, see
             :class:`~torchrl_l1.dynamics.DataBox`.
     """

@@ -1,4 +1,4 @@
-"""What is known of an algorithm without running it: its stages, phases, ways to act and metrics."""
+"""Facts about an algorithm without running it: its stages, phases, ways to act and metrics."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ KINDS = ("stochastic", "deterministic")
 """The ways to act: with sampled actions, and with mean actions."""
 
 MEASURING = "evaluate"
-"""The phase that only measures returns: no part of the training."""
+"""The phase that only measures returns and is not part of the training."""
 
 WINDOW = 3
-"""Outer iterations at the end of a training that its return is the mean of, as in the paper."""
+"""Final outer iterations over which a training's return is averaged, as in the paper."""
 
 _WORDS = {"stochastic": "sampled actions", "deterministic": "mean action"}
 
@@ -23,11 +23,11 @@ class Stage:
     """A stage of an algorithm.
 
     Attributes:
-        name: as users type it; that of what acts in it.
-        words: in headings.
-        window: outer iterations at its end that its return is the mean of.
+        name: its name as users type it; also that of what acts in it.
+        words: its name in headings.
+        window: final outer iterations over which its return is averaged.
         kinds: ways to act whose returns a run logs in it.
-        is_planner: whether what acts is a planner, whose sampled and mean actions are the same.
+        is_planner: whether a planner acts in it, whose sampled and mean actions are the same.
         with_l1: whether L1 augments the actions in it, if it is on.
     """
 
@@ -44,8 +44,8 @@ class Phase:
     """A phase of an outer iteration.
 
     Attributes:
-        words: that a progress bar shows.
-        heading: of its column in a report's table of times; that has none for it if empty.
+        words: text of its progress bar.
+        heading: heading of its column in a report's table of times; without a column if empty.
     """
 
     words: str
@@ -54,12 +54,12 @@ class Phase:
 
 @dataclass(frozen=True)
 class Variant:
-    """A form of an algorithm that reports show as an algorithm of its own.
+    """A form of an algorithm that reports show as a separate algorithm.
 
     Attributes:
-        name: in headings and tables.
-        color: of its lines where algorithms are compared.
-        settings: values of the dotted keys that make a run one of it.
+        name: its name in headings and tables.
+        color: colour of its lines in comparisons of algorithms.
+        settings: values of the dotted keys that identify its runs.
     """
 
     name: str
@@ -69,21 +69,20 @@ class Variant:
 
 @dataclass(frozen=True)
 class AlgorithmFacts:
-    """An algorithm as those see it who run, evaluate and report it.
+    """What runs, evaluations and reports know about an algorithm.
 
     Attributes:
-        name: in headings and tables.
-        stages: in turn; where there are several, ``stage`` in the metrics counts them from 1.
-        phases: columns of ``timing.csv``, in the order in which an outer iteration goes through
-            them.
+        name: its name in headings and tables.
+        stages: its stages in order; if there are several, ``stage`` in the metrics counts from 1.
+        phases: columns of ``timing.csv``, in the order of an outer iteration.
         metrics: columns of ``metrics.csv`` with their meaning; ``l1/...`` only with L1 on.
-        color: of its lines where algorithms are compared.
-        tables: numbers of the paper's tables of it: of the returns of the ``training``, and of the
-            evaluations ``sim_to_real`` and ``ablation``.
+        color: colour of its lines in comparisons of algorithms.
+        tables: numbers of the paper's tables on it: for the returns of the ``training``, and for
+            the evaluations ``sim_to_real`` and ``ablation``.
         compares_models: whether the paper compares forms of the model with it (Figure 2).
         reference_logs: whether the authors have released logs of it.
         offline: whether real steps stay the same from one outer iteration to the next.
-        variants: its forms that count as algorithms of their own, by the name of each.
+        variants: its forms that count as separate algorithms, by name.
     """
 
     name: str
@@ -99,22 +98,22 @@ class AlgorithmFacts:
 
     @property
     def stage_names(self) -> tuple[str, ...]:
-        """The names of the stages in turn."""
+        """The names of the stages in order."""
         return tuple(stage.name for stage in self.stages)
 
     @property
     def named_stages(self) -> tuple[Stage, ...]:
-        """The stages that metrics and evaluations name: none where there is only one."""
+        """The stages that metrics and evaluations name: none if there is only one."""
         return self.stages if len(self.stages) > 1 else ()
 
     @property
     def samples(self) -> bool:
-        """Whether acting with sampled actions and with mean actions differ, at the end at least."""
+        """Whether sampled and mean actions differ, at least in the last stage."""
         return not self.stages[-1].is_planner
 
     @property
     def kinds(self) -> Mapping[str, str]:
-        """The ways to act whose returns differ, and in words; one without words if no choice."""
+        """The ways to act whose returns differ, and their words; one without words if only one."""
         return _WORDS if self.samples else {KINDS[0]: ""}
 
     @property
@@ -124,32 +123,32 @@ class AlgorithmFacts:
 
     @property
     def timed_phases(self) -> Mapping[str, str]:
-        """The phases that a report's table of times shows, with the headings of their columns."""
+        """The phases in a report's table of times, with the headings of their columns."""
         return {name: phase.heading for name, phase in self.phases.items() if phase.heading}
 
     @property
     def mean_action_stages(self) -> tuple[int, ...]:
-        """Places of the stages in which a run logs the return of either way to act."""
+        """Positions of the stages in which a run logs the returns of both ways to act."""
         return tuple(i for i, stage in enumerate(self.stages) if len(stage.kinds) > 1)
 
     def of_variant(self, name: str) -> AlgorithmFacts:
-        """What is known of one of the variants: all else is as of the algorithm."""
+        """The facts of a variant: everything else is as for the algorithm."""
         variant = self.variants[name]
         return replace(self, name=variant.name, color=variant.color, variants={})
 
     def acts_in_one_way(self, stage: str = "") -> bool:
-        """Whether sampled and mean actions are the same in a stage; any name may be asked for."""
+        """Whether sampled and mean actions are the same in a stage; any name is accepted."""
         return not self.samples or any(one.is_planner for one in self.stages if one.name == stage)
 
     def position(self, stage: str) -> int:
-        """Place of a stage, from 0; -1 for any other name."""
+        """Position of a stage, from 0; -1 for any other name."""
         return next((i for i, one in enumerate(self.stages) if one.name == stage), -1)
 
     def actions(self, policy: str, stage: str = "") -> str:
-        """How a kind of policy acts, in words; empty where there is no choice."""
+        """How a kind of policy acts, in words; empty if there is no choice."""
         return "" if self.acts_in_one_way(stage) else _WORDS[policy]
 
     def acting(self, policy: str, stage: str = "") -> str:
-        """What acts, in words: the stage's, and how if there is a choice."""
+        """What acts, in words: the stage's words, and how it acts if there is a choice."""
         words = [one.words for one in self.stages if one.name == stage]
         return ", ".join(filter(None, [*words, self.actions(policy, stage)]))

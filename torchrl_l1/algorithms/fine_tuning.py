@@ -1,4 +1,4 @@
-"""Fine-tuning of a policy on real data, by TorchRL's own PPO."""
+"""Fine-tuning of a policy on real data with TorchRL's own PPO."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ _SAMPLED = "sampled"
 _LOG_PROB = "sampled_log_prob"
 
 FINE_TUNING_METRICS: dict[str, str] = {
-    "ppo/kl": "Stage 3: estimate of the KL divergence from the policy that collected, the mean "
+    "ppo/kl": "Stage 3: estimate of the KL divergence from the collecting policy, the mean "
     "difference of log-densities, last pass, nats. It may be slightly negative.",
     "ppo/clip_fraction": "Stage 3: share of likelihood ratios beyond the bound, last pass.",
     "ppo/value_loss": "Stage 3: squared error of the value network, last pass.",
     "ppo/explained_variance": "Stage 3: share of the variance of the value targets that the "
     "network explains, last pass.",
 }
-"""What a round of fine-tuning reports."""
+"""Metrics of a round of fine-tuning."""
 
 
 @dataclass
 class FineTuningReport:
-    """Outcome of a round: means over the last pass, of whichever network.
+    """Outcome of a round: means over the last pass of each network.
 
     Attributes:
-        kl: estimate of the KL divergence from the policy that collected, nats.
+        kl: estimate of the KL divergence from the collecting policy, in nats.
         clip_fraction: share of samples whose likelihood ratio is beyond the bound.
         value_loss: squared error of the value network, reward units squared.
         explained_variance: share of the variance of the value targets that it explains.
@@ -98,14 +98,14 @@ class FineTuning:
         }
 
     def step(self, data: TensorDictBase, progress: float = 0.0) -> FineTuningReport:
-        """One round of PPO on episodes ``[N, T]`` that :func:`exploring` has collected.
+        """One round of PPO on episodes ``[N, T]`` collected by :func:`exploring`.
 
         Args:
             data: the episodes; values and advantages are written to them.
-            progress: share of the annealing that is over, from 0 to 1.
+            progress: completed share of the annealing, from 0 to 1.
 
         Raises:
-            ValueError: if advantages are not finite; nothing has been learned from them then.
+            ValueError: if advantages are not finite; nothing is learned from them.
         """
         config = self.config
         rates = (config.learning_rate, config.value_learning_rate)
@@ -116,7 +116,7 @@ class FineTuning:
         if not torch.isfinite(data["advantage"]).all():
             raise ValueError("PPO: non-finite advantages; check rewards and value estimates")
         keys = ("observation", _SAMPLED, _LOG_PROB, "advantage", "value_target")
-        # Steps that the simulator could not take did not happen.
+        # Steps that the simulator could not take do not count.
         happened = ~data["next", "non_finite"].squeeze(-1)
         samples = data.select(*keys)[happened]
         reports: list[TensorDictBase] = []
@@ -134,7 +134,7 @@ class FineTuning:
         return FineTuningReport(kl, clip_fraction, value_loss, explained)
 
     def _descend(self, report: TensorDictBase, epoch: int) -> None:
-        """A gradient step of the networks whose passes are not over."""
+        """A gradient step of the networks with passes left."""
         objective = report["loss_objective"] + report.get("loss_entropy", 0.0)
         turns = {
             "policy": (objective, self.config.epochs),
@@ -150,7 +150,7 @@ class FineTuning:
                 optimizer.step()
 
     def state_dict(self) -> dict[str, Any]:
-        """What a round leaves behind beside the policy."""
+        """The state that a round leaves besides the policy."""
         return {
             "value": self.value.network.state_dict(),
             "optimizers": {name: o.state_dict() for name, o in self.optimizers.items()},
@@ -164,7 +164,7 @@ class FineTuning:
 
 
 class _Value(nn.Module):
-    """Values ``(..., 1)`` of observations ``(..., n)``, which pass the policy's normaliser."""
+    """Values ``(..., 1)`` of observations ``(..., n)``, normalised by the policy's normaliser."""
 
     def __init__(self, normalizer: Normalizer, network: nn.Module) -> None:
         super().__init__()
@@ -176,10 +176,10 @@ class _Value(nn.Module):
 
 
 def exploring(policy: GaussianPolicy, task: AnyTask) -> TensorDictModuleBase:
-    """What collects for :class:`FineTuning`: ``action`` is clipped to the task's bounds.
+    """The collecting policy for :class:`FineTuning`: ``action`` is clipped to the task's bounds.
 
-    The action before clipping, and the logarithm of its density, are kept beside it: the
-    likelihood ratios of PPO are of what the policy has drawn.
+    The action before clipping and the logarithm of its density are stored beside it: PPO's
+    likelihood ratios are those of the drawn actions.
     """
     low, high = action_bounds(task)
     clip = TensorDictModule(

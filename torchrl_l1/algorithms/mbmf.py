@@ -1,10 +1,10 @@
 """MBMF: random shooting in a learned model, distilled into a policy that PPO then improves.
 
 Three stages (arXiv 1708.02596): the model is fitted to real data that a random-shooting planner
-collects with it; a policy network clones the planner, by DAgger; model-free reinforcement learning
+collects with it; a policy network clones the planner with DAgger; model-free reinforcement learning
 improves the policy on real data. With L1 on, the adaptive controller augments the planner's actions
-in the first stage (arXiv 2403.14860, technical remarks on MBMF in its appendix); the other two do
-not know of it.
+in the first stage (arXiv 2403.14860, technical remarks on MBMF in its appendix); the other two
+stages do not use it.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ class MBMF(Algorithm):
     Attributes:
         start: random data.
         shooting: episodes of the planner that join the data.
-        shooting_measured: full ones beside them.
+        shooting_measured: full episodes of the planner beside the data.
         visits: episodes of the policy whose states are labelled.
         clone_measured: full episodes of the clone.
         practice: episodes that PPO learns from.
-        policy_measured: full ones beside them.
+        policy_measured: full episodes of the policy beside them.
     """
 
     config_class = MBMFConfig
@@ -85,7 +85,7 @@ class MBMF(Algorithm):
             "the cloned policy's mean action, without L1, on `evaluation_episodes` episodes beside "
             "the data. Stage 3: of sampled actions, without L1, in the episodes that PPO learns "
             "from, or in `evaluation_episodes` beside them if those are shorter or ended early.",
-            "return_deterministic": "The same in stages 1 and 2; in stage 3 of the policy's mean "
+            "return_deterministic": "The same in stages 1 and 2; in stage 3, of the policy's mean "
             "action, on `evaluation_episodes` episodes beside the data.",
             "plan/promised_return": "Stages 1 and 2: mean imagined return of the best sequence of "
             "each plan, over collected steps or over the states that the planner labels.",
@@ -109,8 +109,8 @@ class MBMF(Algorithm):
         super().__init__(task, config, l1, perturbation, **surroundings)
         n, m = self.task.observation_dim, self.task.action_dim
         self.planner = self._planner(config.shooting)
-        # In a state that the policy has visited there is no previous plan; the middle of the
-        # bounds must not stand for one: where doing nothing is good, it would beat every draw.
+        # States visited by the policy have no previous plan; the middle of the bounds must not
+        # replace it: where doing nothing is good, it would beat every draw.
         self.labeller = self._planner(replace(config.shooting, warm_start=False))
         self.initial = GaussianPolicy(n, m, config.policy.hidden, config.cloning.std)
         self.clone, self.policy = deepcopy(self.initial), deepcopy(self.initial)
@@ -127,7 +127,7 @@ class MBMF(Algorithm):
         self.cloning = Cloning(self.clone, config.cloning, half, collected)
 
     def _open_environments(self) -> None:
-        """What collects and what measures in each stage, with L1 in those that it acts in."""
+        """The collecting and measuring parts of each stage, with L1 where it acts."""
         config, steps = self.config, self.episode_steps
         shooting, cloning, fine_tuning = (
             self.real if stage.with_l1 else partial(self.real, l1=None) for stage in STAGES
@@ -150,7 +150,7 @@ class MBMF(Algorithm):
         self.policy_measured = explored(**full)
 
     def iterate(self) -> Iterator[IterationResult]:
-        """Run the outer iterations that are left, of all stages, reporting after each."""
+        """Run the remaining outer iterations of all stages, reporting after each."""
         stages = {"shooting": self._shoot, "cloning": self._clone, "fine_tuning": self._fine_tune}
         for iteration in self.rounds():
             name, number = self.config.stage(iteration)
@@ -169,7 +169,7 @@ class MBMF(Algorithm):
             data = self.shooting.collect(self.seed, self.iteration)
             self.check_plans(data)
             self.learning.store(data)
-            # What follows in a plan that is a few steps old does not answer the state.
+            # Later actions of an older plan are not a response to the state.
             planned = data[(data["plan", "step"] % self.config.replan_every == 0).squeeze(-1)]
             self.cloning.store(planned["observation"], planned["action"])
         full = data
@@ -184,7 +184,7 @@ class MBMF(Algorithm):
         }
 
     def _clone(self, number: int) -> dict[str, float]:
-        """Stage 2: the policy visits states, the planner labels them, the policy is fitted."""
+        """Stage 2: the policy visits states, the planner labels them, and the policy is fitted."""
         metrics = self.fit()
         if number > 0:
             with self.phase("collect", "visiting states and labelling them"):
@@ -207,7 +207,7 @@ class MBMF(Algorithm):
         }
 
     def _fine_tune(self, number: int) -> dict[str, float]:
-        """Stage 3: the policy acts without a model, and PPO learns from that."""
+        """Stage 3: the policy acts without a model, and PPO learns from its data."""
         config = self.config.fine_tuning
         if number == 0:
             self.policy.load_state_dict(self.clone.state_dict())
@@ -247,7 +247,7 @@ class MBMF(Algorithm):
 
     @property
     def policies(self) -> Mapping[str, TensorDictModuleBase]:
-        """What acts in real environments after each stage, those that have begun."""
+        """The policies after each stage that has begun."""
         last, _ = self.config.stage(max(self.iteration - 1, 0))
         every = (self.shooting, self.clone_measured, self.policy_measured)
         named = zip(self.facts.stage_names, every, strict=True)
@@ -255,13 +255,13 @@ class MBMF(Algorithm):
         return dict(list(policies.items())[: self.facts.position(last) + 1])
 
     def choices(self) -> dict[str, str]:
-        """Where plans are made, in which precision, and whether compiled."""
+        """Device and precision of planning, and whether it is compiled."""
         return {**super().choices(), **self.planner.sampler.choices()}
 
     def weights(self) -> dict[str, dict[str, Any]]:
         """State dicts of the model, the cloned policy and the one that PPO improves.
 
-        The policies are there once their stage has begun.
+        A policy is included once its stage has begun.
         """
         networks = {"clone": self.clone, "policy": self.policy}
         reached = list(networks.items())[: len(self.policies) - 1]
@@ -290,5 +290,5 @@ class MBMF(Algorithm):
 
 
 def _finite_mean(values: Tensor) -> float:
-    """Mean of the values that are finite; NaN if none is."""
+    """Mean of the finite values; NaN if there are none."""
     return values[values.isfinite()].mean().item()

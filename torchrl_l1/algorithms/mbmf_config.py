@@ -20,18 +20,18 @@ from torchrl_l1.planning import ShootingConfig
 
 STAGES = (
     Stage("shooting", "random shooting", kinds=("stochastic",), is_planner=True),
-    # Each of its rounds fits the policy anew to all that is known by then.
+    # Each of its rounds fits the policy again to all data so far.
     Stage("cloning", "cloning", window=1, kinds=("deterministic",), with_l1=False),
     Stage("fine_tuning", "fine-tuning", with_l1=False),
 )
-"""The stages in turn."""
+"""The stages in order."""
 
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
 
 
 @dataclass
 class ClonedPolicyConfig:
-    """The policy that clones the planner and is fine-tuned then.
+    """The policy that clones the planner and is then fine-tuned.
 
     Attributes:
         hidden: widths of the hidden layers.
@@ -45,21 +45,21 @@ class ClonedPolicyConfig:
 
 @dataclass
 class CloningConfig:
-    """The second stage: a policy network learns what the planner does (DAgger).
+    """The second stage: a policy network learns to imitate the planner (DAgger).
 
     Attributes:
         iterations: rounds. The first clones the planner's own data; before each of the others the
-            policy visits states, and the planner says what it would do there.
-        episodes: real episodes per round but the first, side by side.
-        std: standard deviation of the policy's actions there, action units.
+            policy visits states, and the planner labels them with its actions.
+        episodes: real episodes per round, except the first, side by side.
+        std: standard deviation of the policy's actions there, in action units.
         label_states: whose states the planner labels: those of the ``current`` policy, or of the
-            ``initial`` one with its random weights, as in the published code, where the workers
-            that collect never receive what has been learned.
+            ``initial`` one with its random weights, as in the published code, whose collecting
+            workers never receive what has been learned.
         learning_rate: Adam's step size.
         batch_size: states per gradient step.
         max_epochs: passes over the training data in a round.
         patience: epochs without a lower validation loss before a round stops.
-        validation_fraction: share of the states kept out of training for good.
+        validation_fraction: share of the states permanently held out of training.
     """
 
     iterations: int = 4
@@ -86,16 +86,16 @@ class FineTuningConfig:
     """The third stage: the cloned policy is improved by PPO on real data (arXiv 1707.06347).
 
     Attributes:
-        episodes: real episodes per round, side by side. Where episodes end early, others follow
+        episodes: real episodes per round, side by side. If episodes end early, others follow
             until each environment has taken as many steps as a full episode has.
-        std: standard deviation of the actions at the start, action units.
+        std: initial standard deviation of the actions, in action units.
         value_hidden: widths of the value network's hidden layers.
         learning_rate: Adam's step size for the policy.
-        value_learning_rate: and for the value network.
-        anneal_steps: real steps of this stage over which both fall to zero linearly; they stay if
+        value_learning_rate: Adam's step size for the value network.
+        anneal_steps: real steps of this stage over which both fall linearly to zero; constant if
             null.
         epochs: passes of the policy over a round's data.
-        value_epochs: and of the value network.
+        value_epochs: passes of the value network.
         minibatches: gradient steps per pass.
         clip_epsilon: bound on the change of the likelihood ratio in the objective.
         entropy_coefficient: weight of the entropy bonus.
@@ -138,27 +138,27 @@ class MBMFConfig:
 
     Attributes:
         outer_iterations: rounds of all stages together: ``shooting_iterations``, then
-            ``cloning.iterations``, and fine-tuning in those that are left.
+            ``cloning.iterations``, and fine-tuning in the remaining ones.
         shooting_iterations: rounds of model fit and random shooting.
         random_episodes: real episodes of random actions before the first round.
         random_steps: steps of each; those of a shooting episode if null. On a task that random
-            actions fail at once, many short episodes show more of what matters than a long one.
+            actions fail at once, many short episodes are more informative than a long one.
         shooting_episodes: real episodes per round of shooting, side by side.
         episode_steps: steps of a collected episode, in all stages; the task's horizon if null.
-            Returns are then measured on full episodes that do not join the data.
+            If set, returns are measured on full episodes that do not join the data.
         evaluation_episodes: full episodes with the mean action after each round of cloning and
             fine-tuning (and with sampled actions if those collected are shorter than the task's,
             or ended early).
         replan_every: actions taken from a plan before the next.
         plan_discount: discount of imagined rewards per step.
-        action_bound: random and planned actions are drawn from this far around zero, within the
-            task's own bounds; the whole of these if null. The published code draws from [-1, 1],
-            whatever the bounds.
+        action_bound: random and planned actions are drawn from an interval of this half-width
+            around zero, within the task's own bounds; from all of these if null. The published code
+            draws from [-1, 1], whatever the bounds.
         particles: imagined trajectories per candidate sequence; with ``mean`` there is one.
         propagation: how they travel through the ensemble: ``tsinf``, ``ts1`` or ``mean``, see
             :func:`~torchrl_l1.planning.evaluate`.
-        precision: of the hidden layers in planning: ``float32``, ``bfloat16``, or ``auto`` for
-            what the processor multiplies fastest.
+        precision: precision of the hidden layers in planning: ``float32``, ``bfloat16``, or
+            ``auto`` for the one that the processor multiplies fastest.
         compile_plans: whether to compile the motion of the imagined trajectories, see
             :func:`~torchrl_l1.planning.resolve_compilation`.
         label: action that the model is fitted to: ``nominal`` is the planner's, ``executed`` what
@@ -213,10 +213,10 @@ class MBMFConfig:
         check_planning(self, "shooting", self.shooting.horizon)
 
     def collected_episodes(self, iterations: int) -> int:
-        """Real episodes of so many outer iterations; random data do not count."""
+        """Number of real episodes in so many outer iterations; random data do not count."""
         shot = min(iterations, self.shooting_iterations)
         cloned = min(iterations - shot, self.cloning.iterations)
-        # The first round of cloning learns from what has been collected already.
+        # The first round of cloning learns from data that are already collected.
         return (
             shot * self.shooting_episodes
             + max(cloned - 1, 0) * self.cloning.episodes

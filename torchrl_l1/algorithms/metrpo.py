@@ -3,7 +3,7 @@
 Each outer iteration fits an ensemble to all real transitions so far, improves the policy by TRPO
 on imagined trajectories, and collects real trajectories with the new policy (arXiv 1802.10592).
 With L1 on, the adaptive controller augments the policy's action during collection; the rest of
-the algorithm does not know of it (arXiv 2403.14860, algorithm 2).
+the algorithm does not depend on it (arXiv 2403.14860, algorithm 2).
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class METRPO(Algorithm):
         self.learning = self.make_learning(capacity)
 
     def iterate(self) -> Iterator[IterationResult]:
-        """Run the outer iterations that are left, reporting after each."""
+        """Run the remaining outer iterations, reporting after each."""
         config = self.config
         for iteration in self.rounds():
             if len(self.learning.buffer) == 0:
@@ -148,16 +148,16 @@ class METRPO(Algorithm):
                 **improvement,
                 "policy/std": self.policy.log_std.detach().exp().mean().item(),
             }
-            # The random data are as many as those of an iteration.
+            # There are as many random data as in an iteration.
             yield self.complete((iteration + 2) * self.collection.frames, metrics)
 
     @property
     def policies(self) -> Mapping[str, TensorDictModuleBase]:
-        """What acts in real environments: the policy, its actions clipped if settings say so."""
+        """The policy that acts in real environments, with clipped actions if settings say so."""
         return {"policy": self.collection.policy}
 
     def choices(self) -> dict[str, str]:
-        """Where and in which precision models are fitted and trajectories imagined."""
+        """Device and precision of fits and imagined trajectories."""
         imagination = model_precision(self.dynamics, self.config.precision)
         return {**super().choices(), "imagination": imagination}
 

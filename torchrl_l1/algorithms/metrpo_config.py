@@ -25,10 +25,10 @@ class PolicyConfig:
 
     Attributes:
         hidden: widths of the hidden layers.
-        std: initial standard deviation, action units.
-        reset_std: whether to go back to it at the start of each outer iteration.
+        std: initial standard deviation, in action units.
+        reset_std: whether to return to it at the start of each outer iteration.
         normalize: whether the network sees normalised observations; the statistics are those
-            of all real data and are renewed in each outer iteration.
+            of all real data and are updated in each outer iteration.
     """
 
     hidden: list[int] = field(default_factory=lambda: [32, 32])
@@ -48,42 +48,43 @@ class METRPOConfig:
     Attributes:
         outer_iterations: rounds of fit, policy improvement and collection.
         episodes_per_iteration: real episodes per round (and of random data before the first),
-            run side by side. Where episodes end early, others follow until each environment has
+            run side by side. If episodes end early, others follow until each environment has
             taken as many steps as a full episode has.
-        episode_steps: steps of a collected episode; the task's horizon if null. Where early
-            policies fail early, shorter episodes see more of what matters. Returns are then
-            measured on full episodes that do not join the data.
+        episode_steps: steps of a collected episode; the task's horizon if null. If early policies
+            fail early, shorter episodes are more informative. If set, returns are measured on full
+            episodes that do not join the data.
         evaluation_episodes: full episodes with the mean action after each round (and with
             sampled actions if those collected are shorter than the task's, or ended early).
         trpo_iterations: TRPO steps per round.
         imagined_steps: imagined transitions per TRPO step.
         imagined_horizon: length of an imagined trajectory.
         imagined_from_data: share of the imagined trajectories that start from states in the
-            real data; the others start as the task does. Where the imagined horizon is shorter
-            than the task's, later states are never imagined otherwise.
+            real data; the others start as the task does. Without it, later states are never
+            imagined if the imagined horizon is shorter than the task's.
         imagined_termination: whether imagined trajectories end where the task's episodes do, with
-            the recipe's ``termination=builtin``; any other ``termination`` has its own way. In the
-            published code they do not: a walker that fell goes on, on the ground.
-        box_exit: what an imagined trajectory that leaves the box around the data is worth from
-            there on: nothing (``fail``, the paper's MDP), or what the baseline says of its last
-            state inside (``truncate``).
-        bootstrap: whether an imagined trajectory goes on in the baseline's estimate after its last
-            step, which then does not look at the time. Where the imagined horizon is shorter than
-            the task's, a policy that sees its world end there learns to risk everything in its
-            last steps.
+            the recipe's ``termination=builtin``; any other ``termination`` decides by itself. In
+            the published code they do not: a fallen walker continues on the ground.
+        box_exit: value of an imagined trajectory after it leaves the box around the data: zero
+            (``fail``, the paper's MDP), or the baseline's value of its last state inside
+            (``truncate``).
+        bootstrap: whether the baseline's estimate continues an imagined trajectory after its last
+            step; the baseline then ignores time. If the imagined horizon is shorter than the
+            task's, a policy whose imagined world ends there learns to risk everything in its last
+            steps.
         discount: gamma.
         gae_lambda: lambda of the generalized advantage estimate.
         clip_actions: whether the policy's actions are clipped to their bounds before they act and
-            are stored. The authors' runs without L1 probably did not; with L1 it is refused.
+            are stored. In the authors' runs without L1 they probably were not; ``false`` is
+            refused with L1.
         label: action that the model is fitted to: ``nominal`` is the policy's (the paper's
             choice), ``executed`` what L1 sends to the actuators.
         model: see :class:`ModelConfig`.
         policy: see :class:`PolicyConfig`.
         fit: see :class:`~torchrl_l1.dynamics.FitConfig`.
         trpo: see :class:`~torchrl_l1.objectives.TRPOConfig`.
-        precision: of the hidden layers in imagination: ``float32``, ``bfloat16``, or ``auto`` for
-            the faster one on this machine, see :func:`~torchrl_l1.planning.resolve_precision`.
-            That of fits is ``fit.precision``.
+        precision: precision of the hidden layers in imagination: ``float32``, ``bfloat16``, or
+            ``auto`` for the faster one on this machine, see
+            :func:`~torchrl_l1.planning.resolve_precision`. For fits there is ``fit.precision``.
     """
 
     outer_iterations: int = 33
@@ -113,7 +114,7 @@ class METRPOConfig:
         check_counts(self, "outer_iterations", "episodes_per_iteration", "evaluation_episodes")
 
     def collected_episodes(self, iterations: int) -> int:
-        """Real episodes of so many outer iterations; random data do not count."""
+        """Number of real episodes in so many outer iterations; random data do not count."""
         return iterations * self.episodes_per_iteration
 
 
@@ -135,7 +136,7 @@ class ImprovementConfig(Protocol):
 
 
 def check_improvement(settings: ImprovementConfig) -> None:
-    """Refuse what no policy can be improved with in imagination.
+    """Refuse settings with which no policy can be improved in imagination.
 
     Raises:
         ValueError: naming the setting.
@@ -154,10 +155,10 @@ def check_improvement(settings: ImprovementConfig) -> None:
 
 
 def check_clipping(clip_actions: bool, with_l1: bool) -> None:
-    """Refuse unclipped actions where L1 acts.
+    """Refuse unclipped actions if L1 acts.
 
     Raises:
-        ValueError: saying what to change.
+        ValueError: naming the remedy.
     """
     if with_l1 and not clip_actions:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""What algorithms around a learned model keep: their data, the model and its optimizer."""
+"""State of algorithms around a learned model: their data, the model and its optimizer."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ FIT_METRICS: dict[str, str] = {
     "model/epochs": "Passes over the training data.",
     "model/gradient_steps": "Adam steps.",
 }
-"""What a fit of the model reports."""
+"""Metrics of a fit of the model."""
 
 
 class TrainingData:
-    """All that has been seen so far, a fixed share of it kept out of training for good.
+    """All data so far, of which a fixed share is permanently held out of training.
 
-    :func:`~torchrl_l1.dynamics.transitions.split_validation` tells the two parts apart.
+    :func:`~torchrl_l1.dynamics.transitions.split_validation` separates the two parts.
 
     Args:
-        capacity: items that there is room for.
-        batch_size: items that the buffer samples at once.
-        validation_fraction: the share kept out.
+        capacity: maximum number of items.
+        batch_size: number of items that the buffer samples at once.
+        validation_fraction: the share held out.
 
     Attributes:
         buffer: the items, with the flag ``validation``.
@@ -42,16 +42,16 @@ class TrainingData:
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(capacity), batch_size=batch_size)
 
     def extend(self, items: TensorDictBase) -> None:
-        """Add items ``[N]``, drawing for each whether it is kept out.
+        """Add items ``[N]``, drawing for each whether it is held out.
 
         Raises:
-            ValueError: if there is no room for them: a buffer would forget the oldest ones.
+            ValueError: if there is no room for them: a buffer would drop the oldest ones.
         """
         count = len(self.buffer) + items.shape[0]
         if count > self.capacity:
             raise ValueError(
-                f"there is room for {self.capacity} items, not for {count}: where outer_iterations "
-                "was raised, make the algorithm anew with it and load this one's state_dict()"
+                f"there is room for {self.capacity} items, not for {count}: if outer_iterations "
+                "was raised, make a new algorithm with it and load this one's state_dict()"
             )
         items["validation"] = torch.rand(items.shape[0]) < self.validation_fraction
         if items.shape[0]:
@@ -76,11 +76,11 @@ class ModelLearning:
         config: how it is fitted.
         label: ``nominal`` fits it to the policy's action, ``executed`` to what L1 sent to the
             actuators.
-        capacity: real transitions that there is room for.
-        terminations: whether to keep which transitions terminated an episode.
+        capacity: maximum number of real transitions.
+        terminations: whether to store which transitions terminated an episode.
 
     Raises:
-        ValueError: if the settings do not fit the model: before any data are collected.
+        ValueError: if the settings do not fit the model, before any data are collected.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class ModelLearning:
         self._kept += [("next", "terminated")] * terminations
 
     def reserve(self, capacity: int) -> None:
-        """Forget all transitions, and make room for so many."""
+        """Drop all transitions and set a new capacity."""
         config = self.config
         self.data = TrainingData(capacity, config.batch_size, config.validation_fraction)
         self.buffer = self.data.buffer
@@ -116,7 +116,7 @@ class ModelLearning:
         self.data.extend(flat.select(*self._kept))
 
     def fit(self, on_epoch: Callable[[int], None] | None = None) -> FitReport:
-        """Fit the model to all data, from the weights that it has."""
+        """Fit the model to all data, starting from its current weights."""
         return fit_ensemble(
             self.dynamics,
             self.buffer,
@@ -135,7 +135,7 @@ class ModelLearning:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from :meth:`state_dict`; other entries of ``state`` do not matter."""
+        """Continue from :meth:`state_dict`; other entries of ``state`` are ignored."""
         self.dynamics.load_state_dict(state["dynamics"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.data.load(state["buffer"])

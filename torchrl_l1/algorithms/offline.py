@@ -1,10 +1,10 @@
 """Offline model-based learning: a dataset, a model, and a policy that is improved in it alone.
 
 The ensemble is fitted once to the data. A policy, cloned from the data's actions, is improved by
-TRPO on imagined trajectories that are short, start in the data and pay for what the model does not
-know: MOPO takes it off the reward (arXiv 2005.13239), MOReL ends the trajectory (arXiv
-2005.05951). The real system is met only to measure the policy, and L1, which needs the model and
-nothing else, augments its actions there: the future work of arXiv 2403.14860.
+TRPO on imagined trajectories that are short, start in the data and are penalized for the model's
+uncertainty: MOPO subtracts it from the reward (arXiv 2005.13239), MOReL ends the trajectory (arXiv
+2005.05951). The real system is used only to measure the policy, and L1, which needs nothing but the
+model, augments its actions there: the future work of arXiv 2403.14860.
 """
 
 from __future__ import annotations
@@ -52,36 +52,35 @@ from torchrl_l1.objectives import NonFiniteAdvantages
 
 OFFLINE_METRICS: dict[str, str] = {
     "data/transitions": "Transitions of the dataset.",
-    "data/dropped": "Rows of it that were no transitions: values that are not finite, steps "
-    "across a reset.",
+    "data/dropped": "Rows of it that are not transitions: non-finite values, steps across a reset.",
     "data/reward": "Mean of the task's reward over the transitions.",
     "clone/validation_loss": "Mean squared difference between the cloned policy's mean action and "
-    "the data's, in halves of the action range, on states kept out of training; 0 without cloning.",
+    "the data's, in halves of the action range, on states held out of training; 0 without cloning.",
     "clone/return": "Mean return of `evaluation_episodes` real episodes with the mean action of "
-    "the first policy, cloned or random: what imagination has to add to.",
+    "the first policy, cloned or random: what imagination has to improve.",
 }
-"""What is known of the data and of the first policy; the same in all outer iterations."""
+"""Metrics of the data and the first policy; the same in all outer iterations."""
 
 
 class Offline(Algorithm):
     """The algorithm and its state; :meth:`iterate` is the loop.
 
     Args:
-        task: a task, or its name, see :func:`torchrl_l1.envs.get_task`: its rewards and its bounds
-            count, and the real system that policies are measured on is of it.
+        task: a task, or its name, see :func:`torchrl_l1.envs.get_task`: it provides rewards,
+            bounds, and the real system on which policies are measured.
         config: settings.
         l1: the adaptive controller used in measurements; ``None`` for none.
         perturbation: noise and disturbances of the real environments.
         data: transitions with ``observation``, ``action`` and ``("next", "observation")``, see
-            :func:`~torchrl_l1.dynamics.read_transitions`, or a function that reads them. Those of
-            ``executed`` actions count where there are any and ``config.label`` says so.
+            :func:`~torchrl_l1.dynamics.read_transitions`, or a function that reads them.
+            ``executed`` actions are used if there are any and ``config.label`` says so.
         **surroundings: see :class:`~torchrl_l1.algorithms.Algorithm`.
 
     Raises:
         ValueError: if a reward or a termination is to be learned.
 
     Attributes:
-        pessimism: what imagined trajectories pay for the model's uncertainty.
+        pessimism: the penalty on imagined trajectories for the model's uncertainty.
 
     Examples:
         >>> from torchrl_l1.envs import make_env
@@ -141,8 +140,8 @@ class Offline(Algorithm):
         super().__init__(task, config, l1, perturbation, **surroundings)
         if self.outcomes.models:
             raise ValueError(
-                f"{' and '.join(self.outcomes.models)}: offline learning goes by rewards and "
-                "terminations that are known; choose builtin or MODULE:FUNCTION instead of learned"
+                f"{' and '.join(self.outcomes.models)}: offline learning needs known rewards and "
+                "terminations; choose builtin or MODULE:FUNCTION instead of learned"
             )
         self.data = data
         n, m = self.task.observation_dim, self.task.action_dim
@@ -158,16 +157,16 @@ class Offline(Algorithm):
             horizon=self.horizon,
         )
         self.learning = self.make_learning(capacity=1)
-        # What the first outer iteration has found out for all.
+        # What the first outer iteration finds out for all.
         self.known: dict[str, float] = {}
 
     def prepare(self) -> None:
-        """Read the dataset, unless it is there.
+        """Read the dataset, unless it has been read.
 
         Raises:
-            KeyError: if it lacks what a transition has.
+            KeyError: if it lacks an entry of a transition.
             OSError: if it cannot be read.
-            ValueError: if there is none, or if it is of no use for the task.
+            ValueError: if there is none, or it does not fit the task.
         """
         if len(self.learning.buffer):
             return
@@ -204,7 +203,7 @@ class Offline(Algorithm):
             },
             batch_size=[rows],
         ).cpu()
-        # Drawn from a stream of its own: the data may be read before or within the loop.
+        # Drawn from its own stream: the data may be read before or within the loop.
         seed_streams(self.seed, "dataset")
         self.learning.reserve(rows)
         self.learning.store(flat)
@@ -227,7 +226,7 @@ class Offline(Algorithm):
             )
 
     def iterate(self) -> Iterator[IterationResult]:
-        """Run the outer iterations that are left, reporting after each."""
+        """Run the remaining outer iterations, reporting after each."""
         config = self.config
         if self.iteration == 0:
             self.prepare()
@@ -240,9 +239,9 @@ class Offline(Algorithm):
                     self.acting_policy.load_state_dict(self.policy.state_dict())
                     first = self.evaluation.evaluate(self.seed, iteration)
                     self.known["clone/return"] = episode_returns(first).mean().item()
-                    # An environment of elsewhere does not tell how its episodes start.
+                    # An external environment does not tell how its episodes start.
                     self.improvement.see(first[:, :1])
-                # That has begun a stream of its own.
+                # The evaluation has begun another stream.
                 seed_streams(self.seed, "improvement")
 
             with self.phase("trpo"):
@@ -280,7 +279,7 @@ class Offline(Algorithm):
             self.pessimism.calibrate(data["observation"], data["action"], reward)
 
     def _first_policy(self) -> dict[str, float]:
-        """The phase in which the policy is fitted to the data's actions, if settings say so."""
+        """The phase that fits the policy to the data's actions, if settings say so."""
         config, data = self.config.cloning, self.learning.buffer[:]
         normalize = self.config.policy.normalize
         with self.phase("clone"):
@@ -297,11 +296,11 @@ class Offline(Algorithm):
 
     @property
     def policies(self) -> Mapping[str, TensorDictModuleBase]:
-        """What acts in real environments: the policy, its actions clipped."""
+        """The policy that acts in real environments, with clipped actions."""
         return {"policy": self.evaluation.policy}
 
     def choices(self) -> dict[str, str]:
-        """Where and in which precision models are fitted and trajectories imagined."""
+        """Device and precision of fits and imagined trajectories."""
         imagination = model_precision(self.dynamics, self.config.precision)
         return {**super().choices(), "imagination": imagination}
 
@@ -310,7 +309,7 @@ class Offline(Algorithm):
         return {**super().weights(), "policy": self.policy.state_dict()}
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to continue, the data included, as plain tensors and numbers."""
+        """Everything needed to continue, including the data, as plain tensors and numbers."""
         return {
             **super().state_dict(),
             "policy": self.policy.state_dict(),

@@ -17,23 +17,23 @@ from torchrl_l1.dynamics import FitConfig
 from torchrl_l1.objectives import TRPOConfig
 
 PENALTIES = ("mopo", "morel", "none")
-"""What is done about a model that does not know, see :class:`OfflineConfig`."""
+"""Penalties for the model's uncertainty, see :class:`OfflineConfig`."""
 
 MEASURES = ("auto", "deviation", "disagreement")
-"""How it is measured what a model does not know, see :class:`OfflineConfig`."""
+"""Measures of the model's uncertainty, see :class:`OfflineConfig`."""
 
 
 @dataclass
 class DatasetColumns:
-    """Names of what a dataset holds; empty lists and null for the usual ones.
+    """Names of the contents of a dataset; empty lists and null for the usual ones.
 
     Attributes:
         observation: columns of a CSV file, arrays of an NPZ file, or the key of tensordicts and
-            Minari's dictionaries; ``observation`` if empty, but for CSV files, which need it.
+            Minari's dictionaries; ``observation`` if empty, except for CSV files, which need it.
         action: likewise; ``action`` if empty.
         episode: column or array that numbers the episodes of a CSV or NPZ file; that of NPZ files
             is ``episode``, if there is one.
-        time: column or array of the time there, s.
+        time: column or array of the time there, in seconds.
     """
 
     observation: list[str] = field(default_factory=list)
@@ -47,12 +47,12 @@ class OfflineCloningConfig:
     """The fit of the first policy to the actions in the data.
 
     Attributes:
-        enabled: whether there is one; otherwise the first policy is random.
+        enabled: whether to clone; otherwise the first policy is random.
         learning_rate: Adam's step size.
         batch_size: states per gradient step.
         max_epochs: passes over the data.
         patience: epochs without a lower validation loss before it stops.
-        validation_fraction: share of the states kept out of training.
+        validation_fraction: share of the states held out of training.
     """
 
     enabled: bool = True
@@ -74,42 +74,44 @@ class OfflineConfig:
 
     Attributes:
         outer_iterations: rounds of policy improvement, each followed by a measurement.
-        dataset: where the data are: a Minari dataset's name or folder, a run directory, a folder
+        dataset: source of the data: a Minari dataset's name or folder, a run directory, a folder
             of a memory-mapped tensordict, or a file: ``.pt``, ``.safetensors``, ``.npz``, ``.csv``.
         columns: see :class:`DatasetColumns`.
-        label: action of a run directory's data that counts: ``nominal`` is the policy's,
-            ``executed`` what L1 sent to the actuators. Others have one action.
-        penalty: ``mopo`` takes ``penalty_coefficient`` times the uncertainty off the reward
+        label: action to use from a run directory's data: ``nominal`` is the policy's,
+            ``executed`` what L1 sent to the actuators. Other sources have one action.
+        penalty: ``mopo`` subtracts ``penalty_coefficient`` times the uncertainty from the reward
             (arXiv 2005.13239); ``morel`` ends an imagined trajectory where the uncertainty is
             above a threshold, in a state that is worth ``penalty_coefficient`` less per step than
             the worst in the data (arXiv 2005.05951); ``none`` trusts the model.
-        penalty_coefficient: see ``penalty``, reward units.
+        penalty_coefficient: see ``penalty``, in reward units.
         uncertainty: ``deviation``, the largest norm of the standard deviations that a member with
             a Gaussian head predicts; ``disagreement``, the largest distance between the means of
-            two members; ``auto``, the former where there are such heads. In units of the standard
-            deviation that an entry's change of one step has in the data.
-        halt_deviations: the threshold is this many standard deviations above the mean of the
-            uncertainty of the data.
-        evaluation_episodes: real episodes after each round, with the mean action and as many with
-            sampled ones. Nothing is learned from them.
+            two members; ``auto``, the former if there are such heads. In units of the standard
+            deviation of an entry's one-step changes in the data.
+        halt_deviations: the threshold is this many standard deviations above the mean uncertainty
+            of the data.
+        evaluation_episodes: real episodes after each round with the mean action, and as many with
+            sampled actions. Nothing is learned from them.
         trpo_iterations: TRPO steps per round.
         imagined_steps: imagined transitions per TRPO step.
         imagined_horizon: length of an imagined trajectory.
         imagined_from_data: share of the imagined trajectories that start in the data; the others
             start as the task does.
         imagined_termination: whether imagined trajectories end where the task's episodes do.
-        box_exit: what an imagined trajectory that leaves the box around the data is worth, see
+        box_exit: value of an imagined trajectory that leaves the box around the data, see
             :class:`~torchrl_l1.algorithms.METRPOConfig`. With ``morel`` it is halted there.
-        bootstrap: whether an imagined trajectory goes on in the baseline's estimate, likewise.
+        bootstrap: whether the baseline's estimate continues an imagined trajectory, likewise.
         discount: gamma.
         gae_lambda: lambda of the generalized advantage estimate.
         model: see :class:`ModelConfig`.
         policy: see :class:`PolicyConfig`. With ``normalize``, which is on here, the statistics are
-            those of the states that cloning trains on, or of all data without cloning; they stay.
-        fit: see :class:`~torchrl_l1.dynamics.FitConfig`. There is one fit only.
+            those of the states that cloning trains on, or of all data without cloning, and do not
+            change.
+        fit: see :class:`~torchrl_l1.dynamics.FitConfig`. There is only one fit.
         cloning: see :class:`OfflineCloningConfig`.
         trpo: see :class:`~torchrl_l1.objectives.TRPOConfig`.
-        precision: of the hidden layers in imagination: ``float32``, ``bfloat16``, or ``auto``.
+        precision: precision of the hidden layers in imagination: ``float32``, ``bfloat16``, or
+            ``auto``.
     """
 
     outer_iterations: int = 10
@@ -149,7 +151,7 @@ class OfflineConfig:
                 "uncertainty=deviation needs members that predict a distribution: set "
                 "model.head=gaussian, or uncertainty=disagreement"
             )
-        # Elites alone are asked.
+        # Only elites are used.
         counts = {"model.members": self.model.members, "fit.elites": self.fit.elites or 2}
         for name, count in counts.items():
             if self.penalty != "none" and self.measure == "disagreement" and count < 2:
@@ -159,22 +161,22 @@ class OfflineConfig:
                 )
         if self.penalty == "morel" and self.bootstrap and self.discount == 1:
             raise ValueError(
-                "penalty=morel with bootstrap=true needs a discount below 1: a trajectory that is "
-                "halted would be worth minus infinity"
+                "penalty=morel with bootstrap=true needs a discount below 1: a halted trajectory "
+                "would be worth minus infinity"
             )
 
     @property
     def episode_steps(self) -> None:
-        """Measured episodes are full ones."""
+        """None, since measured episodes are full ones."""
         return None
 
     @property
     def measure(self) -> str:
-        """What ``uncertainty`` becomes: ``deviation`` or ``disagreement``."""
+        """The resolved ``uncertainty``: ``deviation`` or ``disagreement``."""
         if self.uncertainty != "auto":
             return self.uncertainty
         return "deviation" if self.model.head == "gaussian" else "disagreement"
 
     def collected_episodes(self, iterations: int) -> int:
-        """Real episodes of so many outer iterations: those that are measured."""
+        """Number of real episodes in so many outer iterations: the measured ones."""
         return iterations * self.evaluation_episodes

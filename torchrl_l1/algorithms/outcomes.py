@@ -1,4 +1,4 @@
-"""Where rewards and ends of imagined trajectories come from: the task, functions, or models."""
+"""Rewards and terminations of imagined trajectories: from the task, functions, or models."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from torchrl_l1.dynamics.transitions import split_validation
 from torchrl_l1.envs import AnyTask, ExternalTask, StartStates, Task, action_bounds, load_attribute
 
 REWARDS = ("builtin", "learned")
-"""The words of ``reward``; anything else is a function."""
+"""Keywords of ``reward``; anything else is a function."""
 
 TERMINATIONS = ("builtin", "learned", "none")
-"""The words of ``termination``; anything else is a function."""
+"""Keywords of ``termination``; anything else is a function."""
 
 OUTCOME_METRICS: dict[str, str] = {
     "reward_model/validation_loss": "With `reward=learned`: mean over members of the lowest "
@@ -42,22 +42,22 @@ OUTCOME_METRICS: dict[str, str] = {
     "lowest validation loss, nats, terminal states weighted; 0 before one is seen.",
     "termination_model/terminal": "With `termination=learned`: share of the training transitions "
     "that ended an episode.",
-    "termination_model/missed": "With `termination=learned`: share of the terminal states kept out "
+    "termination_model/missed": "With `termination=learned`: share of the terminal states held out "
     "of training that the model does not call terminal; 0 if there are none.",
-    "termination_model/false_alarms": "With `termination=learned`: share of the other states kept "
+    "termination_model/false_alarms": "With `termination=learned`: share of the other states held "
     "out of training that it calls terminal.",
 }
-"""What the fits of learned rewards and terminations report."""
+"""Metrics of the fits of learned rewards and terminations."""
 
 
 @dataclass
 class OutcomeConfig:
-    """The ensembles of a learned reward and a learned termination, each of its own.
+    """The separate ensembles of a learned reward and a learned termination.
 
-    They are fitted as the dynamics are, without decay, resampling and elites.
+    They are fitted like the dynamics, but without decay, resampling and elites.
 
     Attributes:
-        members: number of networks; their mean counts.
+        members: number of networks, whose mean is used.
         hidden: widths of their hidden layers.
         activation: ``relu``, ``tanh`` or ``silu``.
     """
@@ -73,11 +73,11 @@ class OutcomeConfig:
 
 
 def check_outcome(name: str, value: str) -> None:
-    """Refuse what is neither a word nor the form of a function, with a ``ValueError``.
+    """Refuse, with a ``ValueError``, what is neither a keyword nor the form of a function.
 
     Args:
         name: ``reward`` or ``termination``.
-        value: what it is set to.
+        value: its value.
 
     Examples:
         >>> check_outcome("reward", "me")
@@ -94,32 +94,32 @@ def check_outcome(name: str, value: str) -> None:
 
 
 class Outcomes:
-    """What imagined transitions earn, and which of them end an episode.
+    """Rewards and terminations of imagined transitions.
 
-    Models of either are fitted after the dynamics, to the same data. Their random numbers are
-    streams of their own: what else is drawn in a run does not depend on them.
+    Models of either are fitted after the dynamics, to the same data. They have their own random
+    streams: no other random numbers of a run depend on them.
 
     Args:
-        task: whose reward and termination are the built-in ones.
+        task: the task, which provides the built-in reward and termination.
         reward: ``builtin``, ``learned``, or a function ``MODULE:FUNCTION`` of observation, action
-            and next observation, batched torch.
+            and next observation, in batched torch.
         termination: ``builtin``, ``learned``, ``none``, or a function of the next observation.
-        config: of the models.
+        config: settings of the models.
         fit: how the dynamics are fitted.
-        std_floor: smallest standard deviation of the normalisers, raw units.
-        margin: how far a learned reward may lie beyond those of the data, fraction of their range.
-        seed: of the run.
-        device: of the models.
+        std_floor: smallest standard deviation of the normalisers, in raw units.
+        margin: how far a learned reward may exceed those of the data, as a fraction of their range.
+        seed: seed of the run.
+        device: device of the models.
         search_path: folders for files and modules that are named.
 
     Attributes:
         own_termination: whether imagined trajectories end as the task does.
         reward: maps observations ``(..., n)``, actions ``(..., m)`` and next observations to
             ``(...)``.
-        models: those that are learned, by their names.
+        models: the learned models by name.
 
     Raises:
-        ValueError: if there is no such function, or if it does not do what it should.
+        ValueError: if there is no such function, or it returns something unsuitable.
     """
 
     def __init__(
@@ -138,7 +138,7 @@ class Outcomes:
     ) -> None:
         check_outcome("reward", reward)
         check_outcome("termination", termination)
-        # What is theirs alone: decay goes by the layers of the dynamics, elites by its members.
+        # Their own values: decay is set per layer of the dynamics, elites per member.
         alone: dict[str, Any] = {
             "weight_decay": [],
             "weight_penalty": 0.0,
@@ -163,7 +163,7 @@ class Outcomes:
                 found = _transitions(task, self.device)
                 self.reward = _function("reward", reward, found, search_path)
             if self.own_termination:
-                _ = task.terminates  # an environment of elsewhere may not tell
+                _ = task.terminates  # an external environment may not tell
             if termination == "learned":
                 ends = TerminationModel(n, **networks, std_floor=std_floor).to(self.device)
                 self._termination = self.models["termination_model"] = ends
@@ -177,25 +177,25 @@ class Outcomes:
 
     @property
     def learns_terminations(self) -> bool:
-        """Whether data must say where episodes terminated."""
+        """Whether data must tell where episodes terminated."""
         return "termination_model" in self.models
 
     def termination(self, as_task: bool = True) -> Termination | None:
-        """What ends imagined trajectories; nothing does if ``None``.
+        """The function that ends imagined trajectories; ``None`` if they do not end.
 
         Args:
-            as_task: whether they end as the task does, where ``termination`` is ``builtin``.
+            as_task: whether they end as the task does if ``termination`` is ``builtin``.
         """
         if not self.own_termination:
             return self._termination
         return self.task.terminated if as_task and self.task.terminates else None
 
     def fit(self, buffer: ReplayBuffer, action_key: str, iteration: int) -> dict[str, float]:
-        """Fit what is learned to all data, from the weights that it has; returns its metrics.
+        """Fit the learned models to all data, from their current weights; returns their metrics.
 
         Args:
             buffer: transitions with the flag ``validation``.
-            action_key: of the action that the dynamics are fitted to.
+            action_key: key of the action that the dynamics are fitted to.
             iteration: the outer iteration, for the random numbers.
         """
         if not self.models:
@@ -228,18 +228,18 @@ class Outcomes:
 
     @contextmanager
     def _stream(self, *names: str | int) -> Iterator[None]:
-        """Random numbers of their own; the global ones go on as if nothing had been drawn."""
+        """Separate random numbers, which leave the global generator untouched."""
         on_cpu = self.device.type == "cpu"
         with torch.random.fork_rng(devices=[] if on_cpu else [self.device]):
             seed_streams(self.seed, "outcomes", *names)
             yield
 
     def weights(self) -> dict[str, dict[str, Any]]:
-        """State dicts of the models, by their names."""
+        """State dicts of the models by name."""
         return {name: model.state_dict() for name, model in self.models.items()}
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to continue; nothing where nothing is learned."""
+        """Everything needed to continue; empty if nothing is learned."""
         return {
             name: {"model": model.state_dict(), "optimizer": self.optimizers[name].state_dict()}
             for name, model in self.models.items()
@@ -253,7 +253,7 @@ class Outcomes:
 
 
 def _finite(data: TensorDictBase, *keys: NestedKey) -> Tensor:
-    """Which rows of ``[N]`` are finite under all keys: ``(N,)``."""
+    """Rows of ``[N]`` that are finite under all keys: ``(N,)``."""
     return torch.stack([data[key].isfinite().flatten(1).all(1) for key in keys]).all(0)
 
 
@@ -271,26 +271,26 @@ def _transitions(task: AnyTask, device: torch.device) -> list[Tensor]:
 def _function(
     name: str, value: str, transitions: list[Tensor], search_path: Sequence[str] = ()
 ) -> Callable[..., Tensor]:
-    """A user's function, which must be batched torch and give numbers of the right kind.
+    """A user's function, which must be batched torch and return the right dtype.
 
     Raises:
         ValueError: in one line, naming the setting.
     """
     try:
         function = load_attribute(value, search_path)
-    # A file may fail in any way.
+    # Loading a file may raise anything.
     except Exception as error:
         why = " ".join(str(error).split())[:200]
         raise ValueError(f"{name}={value}: {why}") from error
     if not callable(function):
-        raise ValueError(f"{name}={value} names a {type(function).__name__}, no function")
+        raise ValueError(f"{name}={value} names a {type(function).__name__}, not a function")
     wanted = torch.float32 if name == "reward" else torch.bool
     arguments = "observation, action, next_observation" if name == "reward" else "next_observation"
     for inputs in (transitions, [part.flatten(0, 1) for part in transitions]):
         shape = tuple(inputs[0].shape[:-1])
         try:
             found = function(*inputs)
-        # Whatever the user's own code raises.
+        # The user's own code may raise anything.
         except Exception as error:
             why = " ".join(str(error).split())[:200]
             raise ValueError(
@@ -302,8 +302,8 @@ def _function(
         if tuple(found.shape) != shape:
             raise ValueError(
                 f"{name}={value} must return shape (...) for tensors of shape (..., width), got "
-                f"{tuple(found.shape)} for {shape} + (width,): take entries as x[..., 0] and sum "
-                "over dimension -1"
+                f"{tuple(found.shape)} for {shape} + (width,): index entries as x[..., 0] and "
+                "sum over dimension -1"
             )
         if found.dtype != wanted:
             raise ValueError(f"{name}={value} must return {wanted}, got {found.dtype}")

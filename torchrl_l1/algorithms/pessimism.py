@@ -1,9 +1,9 @@
-r"""What a model does not know, and what imagined trajectories pay for it.
+r"""A model's uncertainty, and the penalty on imagined trajectories for it.
 
-The uncertainty of a state and an action is a number in normalised units: those of the standard
-deviation that each entry's change of one step has in the data. MOPO (arXiv 2005.13239) takes
-a multiple of it off the reward. MOReL (arXiv 2005.05951) sends what is above a threshold to an
-absorbing state, HALT, whose reward is lower than any other.
+The uncertainty of a state and an action is a number in normalised units: the standard deviations of
+each entry's one-step changes in the data. MOPO (arXiv 2005.13239) subtracts a multiple of it from
+the reward. MOReL (arXiv 2005.05951) sends steps above a threshold to an absorbing state, HALT,
+whose reward is lower than any other.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ PENALTY_METRICS: dict[str, str] = {
     "penalty/halted": "Share of the imagined trajectories in the last TRPO step that were halted; "
     "0 with other penalties.",
 }
-"""What is known of the model's uncertainty in each outer iteration."""
+"""Metrics of the model's uncertainty in each outer iteration."""
 
 _CHUNK = 5_000
 
 
 def disagreement(means: Tensor) -> Tensor:
-    """The largest distance between what two members predict.
+    """The largest distance between the predictions of two members.
 
     Args:
         means: normalised changes ``(E, B, n)``.
 
     Returns:
-        Euclidean distances ``(B,)``; zero of a single member.
+        Euclidean distances ``(B,)``; zero for a single member.
 
     Examples:
         >>> disagreement(torch.tensor([[[0.0, 0.0]], [[3.0, 4.0]], [[0.0, 1.0]]]))
@@ -53,10 +53,10 @@ def largest_deviation(deviations: Tensor) -> Tensor:
     """The largest norm of the standard deviations that a member predicts.
 
     Args:
-        deviations: of normalised changes ``(E, B, n)``.
+        deviations: standard deviations of normalised changes ``(E, B, n)``.
 
     Returns:
-        Frobenius norms of the members' diagonal covariances' roots ``(B,)``, the largest of each.
+        the largest Frobenius norm of the roots of the members' diagonal covariances ``(B,)``.
 
     Examples:
         >>> largest_deviation(torch.tensor([[[3.0, 4.0]], [[1.0, 1.0]]]))
@@ -66,12 +66,13 @@ def largest_deviation(deviations: Tensor) -> Tensor:
 
 
 class Uncertainty:
-    """The uncertainty of a fitted ensemble's elites, as their weights are now.
+    """The uncertainty of a fitted ensemble's elites with their current weights.
 
     Args:
         dynamics: the model.
         measure: ``disagreement``, or ``deviation`` for Gaussian heads.
-        precision: of the hidden layers, see :class:`~torchrl_l1.planning.PlanningNetwork`.
+        precision: precision of the hidden layers, see
+            :class:`~torchrl_l1.planning.PlanningNetwork`.
     """
 
     def __init__(
@@ -82,7 +83,7 @@ class Uncertainty:
 
     @torch.no_grad()
     def __call__(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Of observations ``(B, n)`` and actions ``(B, m)``, raw units: ``(B,)``."""
+        """Uncertainty ``(B,)`` at observations ``(B, n)`` and actions ``(B, m)``, raw units."""
         inputs = torch.cat([observation, action], -1)
         parts = [self._of(part) for part in inputs.split(_CHUNK)]
         return torch.cat(parts) if parts else inputs.new_zeros(0)
@@ -101,17 +102,17 @@ class Uncertainty:
 
 
 class Pessimism:
-    """What imagined trajectories pay for the model's uncertainty.
+    """The penalty on imagined trajectories for the model's uncertainty.
 
     Args:
         dynamics: the model.
-        config: penalty, its coefficient, and how uncertainty is measured.
+        config: the penalty, its coefficient, and the measure of uncertainty.
         action_low: lower bounds ``(m,)``; the model sees clipped actions.
         action_high: upper bounds ``(m,)``.
 
     Attributes:
-        data_uncertainty: mean over the data.
-        threshold: above which MOReL halts.
+        data_uncertainty: mean uncertainty over the data.
+        threshold: uncertainty above which MOReL halts.
         halted_reward: reward per step in MOReL's absorbing state.
     """
 
@@ -129,7 +130,7 @@ class Pessimism:
         self._uncertainty: Uncertainty | None = None
 
     def calibrate(self, observation: Tensor, action: Tensor, reward: Tensor) -> None:
-        """Learn from the data what uncertainty and rewards are like in them.
+        """Measure uncertainty and rewards in the data.
 
         Args:
             observation: ``(N, n)``, on the model's device.
@@ -144,7 +145,7 @@ class Pessimism:
         self.halted_reward = float(reward.min()) - self.config.penalty_coefficient
 
     def uncertainty(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Of observations ``(B, n)`` and actions ``(B, m)``: ``(B,)``."""
+        """Uncertainty ``(B,)`` at observations ``(B, n)`` and actions ``(B, m)``."""
         # The model is fitted once: its weights are copied once.
         if self._uncertainty is None:
             config = self.config
@@ -152,9 +153,9 @@ class Pessimism:
         return self._uncertainty(observation, action.clamp(self.action_low, self.action_high))
 
     def __call__(self, trajectories: TensorDict) -> TensorDict:
-        """The penalty on trajectories ``[B, T]`` of :func:`~torchrl_l1.dynamics.imagine`.
+        """Apply the penalty to trajectories ``[B, T]`` of :func:`~torchrl_l1.dynamics.imagine`.
 
-        Those that MOReL halts end there, and their last reward has all that follows in it.
+        Those that MOReL halts end there, and their last reward includes all that follows.
         """
         config, valid = self.config, trajectories["valid"].squeeze(-1)
         unknown = self.uncertainty(
@@ -176,7 +177,7 @@ class Pessimism:
                 config.bootstrap,
             )
             halted = trajectories["next", "halted"].any(1).squeeze(-1)
-        # NaN is a step into the unknown, too, but no mean can be taken of it.
+        # NaN is also a step into the unknown, but has no mean.
         seen = unknown[trajectories["valid"].squeeze(-1)]
         self._measured = {
             "penalty/uncertainty": float(seen.double().mean()),
@@ -185,7 +186,7 @@ class Pessimism:
         return trajectories
 
     def metrics(self) -> dict[str, float]:
-        """Those of ``PENALTY_METRICS``."""
+        """Values of ``PENALTY_METRICS``."""
         return {
             **self._measured,
             "penalty/data_uncertainty": self.data_uncertainty,
@@ -193,12 +194,12 @@ class Pessimism:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """What the data have shown."""
+        """The values measured in the data."""
         names = ("data_uncertainty", "threshold", "halted_reward")
         return {name: getattr(self, name) for name in names}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from :meth:`state_dict`; the model's weights may be others now."""
+        """Continue from :meth:`state_dict`; the model's weights may have changed."""
         for name, value in state.items():
             setattr(self, name, value)
         self._uncertainty = None
@@ -213,22 +214,22 @@ def halt(
 ) -> TensorDict:
     r"""Send imagined trajectories to an absorbing state at their first unknown step.
 
-    The step keeps its own reward :math:`r_t`; from the next one on each has the reward
-    :math:`\rho` of the absorbing state (arXiv 2005.05951, definition 3), to the end of the
-    imagined trajectory of :math:`T` steps, or for ever if that goes on in the baseline's estimate:
+    The step keeps its own reward :math:`r_t`; every later one has the reward :math:`\rho` of the
+    absorbing state (arXiv 2005.05951, definition 3), up to the end of the imagined trajectory of
+    :math:`T` steps, or forever if the baseline's estimate continues it:
 
     .. math::
         r_t + \gamma \rho \frac{1 - \gamma^{T - 1 - t}}{1 - \gamma} \quad\text{or}\quad
         r_t + \frac{\gamma \rho}{1 - \gamma}.
 
-    All of it stands in the reward of the step, which ends the trajectory.
+    All of it goes into the reward of the step, which ends the trajectory.
 
     Args:
-        trajectories: of batch size ``[B, T]``; changed.
-        unknown: steps that are unknown ``(B, T)``, bool.
+        trajectories: batch size ``[B, T]``; changed in place.
+        unknown: which steps are unknown ``(B, T)``, bool.
         halted_reward: :math:`\rho`.
         discount: :math:`\gamma`.
-        bootstrap: whether trajectories go on after their last step.
+        bootstrap: whether the baseline's estimate continues trajectories after their last step.
 
     Returns:
         the trajectories, with ``("next", "halted")`` ``(B, T, 1)``.
@@ -247,7 +248,7 @@ def halt(
         worth[:-1] = halted_reward * powers.cumsum(0).flip(0)
     after = trajectories["next"]
     reward = after["reward"] + (halts * worth.to(after["reward"]))[..., None]
-    # What is no number after the end would be none before it, too: zero times it is none.
+    # A NaN after the end would spread to steps before it: zero times NaN is NaN.
     reward = torch.where(valid[..., None] | reward.isfinite(), reward, 0.0)
     return trajectories.update(
         {

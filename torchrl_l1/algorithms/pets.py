@@ -1,9 +1,9 @@
 """PETS and DETS: planning by trajectory sampling in an ensemble, with or without L1 in the loop.
 
 Each outer iteration fits an ensemble to all real transitions so far and collects real episodes by
-receding-horizon control: at every step, or every few, the cross-entropy method looks for the
+receding-horizon control: at every step, or every few, the cross-entropy method searches for the
 action sequence with the highest imagined return (arXiv 1805.12114). There is no policy network:
-what is learned is the model. With L1 on, the adaptive controller augments the planned actions
+only the model is learned. With L1 on, the adaptive controller augments the planned actions
 (arXiv 2403.14860, section "Comparison with probabilistic models").
 """
 
@@ -56,12 +56,12 @@ class PETS(Algorithm):
         metrics={
             **COMMON_METRICS,
             "return_mean": "Mean return of full real episodes, with L1 if it is on: those that "
-            "join the data, or `evaluation_episodes` beside them if these are asked for or the "
-            "data's are shorter.",
-            "return_deterministic": "The same: the planner acts in one way only.",
+            "join the data, or `evaluation_episodes` beside them if requested or if the data's "
+            "are shorter.",
+            "return_deterministic": "The same: the planner acts in only one way.",
             "plan/promised_return": "Mean over the collected steps of the imagined return of the "
-            "best sequence that the last plan has seen. Far above what comes, it says that plans "
-            "exploit the model.",
+            "best sequence in the last plan. If it is far above the real return, plans exploit "
+            "the model.",
             **L1_METRICS,
         },
         color="#CC79A7",
@@ -100,7 +100,7 @@ class PETS(Algorithm):
         self.fit_report: dict[str, float] = {}
 
     def iterate(self) -> Iterator[IterationResult]:
-        """Run the outer iterations that are left, reporting after each."""
+        """Run the remaining outer iterations, reporting after each."""
         for iteration in self.rounds():
             if len(self.learning.buffer) == 0:
                 with self.phase("random"):
@@ -128,7 +128,7 @@ class PETS(Algorithm):
             )
 
     def measured(self, data: TensorDictBase) -> TensorDictBase:
-        """The collected episodes if they are full, else others beside the data."""
+        """The collected episodes if they are full, otherwise others beside the data."""
         shorter = self.collection.horizon < self.evaluation.horizon
         if shorter or self.config.evaluation_episodes:
             return self.evaluation.evaluate(self.seed, self.iteration)
@@ -136,11 +136,11 @@ class PETS(Algorithm):
 
     @property
     def policies(self) -> Mapping[str, TensorDictModuleBase]:
-        """What acts in real environments: the planner."""
+        """The planner, which acts in real environments."""
         return {"planner": self.policy}
 
     def choices(self) -> dict[str, str]:
-        """Where plans are made, in which precision, and whether compiled."""
+        """Device and precision of planning, and whether it is compiled."""
         return {**super().choices(), **self.policy.sampler.choices()}
 
     def state_dict(self) -> dict[str, Any]:

@@ -20,27 +20,27 @@ class PETSConfig:
     """Settings of :class:`~torchrl_l1.algorithms.PETS`.
 
     With a Gaussian head and sampled trajectories the algorithm is PETS (arXiv 1805.12114); with a
-    deterministic one it is DETS, as arXiv 2403.14860 has it beside L1.
+    deterministic head it is DETS, as combined with L1 in arXiv 2403.14860.
 
     Attributes:
         outer_iterations: rounds of fit and collection.
         random_episodes: real episodes of random actions before the first round.
         random_steps: steps of each; those of a collected episode if null. On a task that random
-            actions fail at once, many short episodes show more of what matters than a long one.
+            actions fail at once, many short episodes are more informative than a long one.
         episodes_per_iteration: real episodes per round, run side by side.
-        episode_steps: steps of a collected episode; the task's horizon if null. Returns are then
+        episode_steps: steps of a collected episode; the task's horizon if null. If set, returns are
             measured on full episodes that do not join the data.
         evaluation_episodes: full episodes beside the data after each round; none by default,
-            since they are as dear as those that join it.
+            since they cost as much as those that join it.
         fit_every: rounds from one fit of the model to the next.
         replan_every: actions taken from a plan before the next.
         particles: imagined trajectories per candidate sequence.
         propagation: how they travel through the ensemble: ``tsinf``, ``ts1`` or ``mean``, see
             :func:`~torchrl_l1.planning.evaluate`.
-        common_noise: whether the particles of all candidates meet the same draws of members and
+        common_noise: whether the particles of all candidates share the same draws of members and
             noise in an iteration of the planner.
-        precision: of the hidden layers in planning: ``float32``, ``bfloat16``, or ``auto`` for
-            what the processor multiplies fastest.
+        precision: precision of the hidden layers in planning: ``float32``, ``bfloat16``, or
+            ``auto`` for the one that the processor multiplies fastest.
         compile_plans: whether to compile the motion of the imagined trajectories: ``true``,
             ``false``, or ``auto`` for ``true`` on a GPU with a working compiler, see
             :func:`~torchrl_l1.planning.resolve_compilation`.
@@ -79,5 +79,5 @@ class PETSConfig:
         check_planning(self, "cem", self.cem.horizon)
 
     def collected_episodes(self, iterations: int) -> int:
-        """Real episodes of so many outer iterations; random data do not count."""
+        """Number of real episodes in so many outer iterations; random data do not count."""
         return iterations * self.episodes_per_iteration

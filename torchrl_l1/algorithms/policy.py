@@ -25,16 +25,17 @@ from torchrl_l1.dynamics import Normalizer
 from torchrl_l1.envs import AnyTask, action_bounds
 from torchrl_l1.objectives import is_tanh_network
 
-# Standard deviations between an entry's mean and zero up to which statistics fold into weights.
+# Statistics are folded into weights if an entry's mean is this many standard deviations from zero
+# at most.
 _MOST_OFFSET = 1e4
 
 _MEAN = (ExplorationType.DETERMINISTIC, ExplorationType.MEAN, ExplorationType.MODE)
 
 
 class GaussianPolicy(nn.Module):
-    """Tanh network for the mean, a free parameter for the logarithm of the standard deviation.
+    """Tanh network for the mean, with a free parameter for the log standard deviation.
 
-    Observations pass a normaliser first, which is the identity until it is fitted.
+    Observations first pass a normaliser, which is the identity until it is fitted.
 
     Args:
         observation_dim: number of observations, n.
@@ -52,7 +53,7 @@ class GaussianPolicy(nn.Module):
         widths = [observation_dim, *hidden]
         for fan_in, fan_out in pairwise(widths):
             layers += [_normalized_linear(fan_in, fan_out, 1.0), nn.Tanh()]
-        # A small last layer: the first policy is close to zero-mean noise.
+        # The last layer is small: the first policy is close to zero-mean noise.
         layers.append(_normalized_linear(widths[-1], action_dim, 0.01))
         self.mean = nn.Sequential(*layers)
         self.log_std = nn.Parameter(torch.zeros(action_dim))
@@ -76,19 +77,19 @@ class GaussianPolicy(nn.Module):
 
     @property
     def is_plain(self) -> bool:
-        """Whether it is what this class makes, of which faster code may know the inside."""
+        """Whether it is exactly this class, whose internals faster code may use."""
         return type(self) is GaussianPolicy and is_tanh_network(self.mean)
 
     @torch.no_grad()
     def sampler(self) -> Callable[[Tensor], Tensor]:
-        """What :meth:`sample` does with the parameters as they are now, for many calls.
+        """A faster :meth:`sample` with the current parameters, for many calls.
 
-        The statistics are folded into the first layer, and nothing is prepared twice. A policy of
-        one's own samples as it does.
+        The statistics are folded into the first layer, and nothing is prepared twice. A user's own
+        policy keeps its own sampling.
         """
         if not self.is_plain:
             return torch.no_grad()(self.sample)
-        # An entry that lies far from zero for its spread would lose its digits.
+        # An entry far from zero relative to its spread would lose precision.
         if bool((self.normalizer.mean.abs() > _MOST_OFFSET * self.normalizer.std).any()):
             return torch.no_grad()(deepcopy(self).sample)
         layers = [layer for layer in self.mean if isinstance(layer, nn.Linear)]
@@ -121,15 +122,15 @@ def _normalized_linear(fan_in: int, fan_out: int, norm: float) -> nn.Linear:
 class GaussianActor(ProbabilisticActor):
     """TorchRL actor around a :class:`GaussianPolicy`, light enough to act at every step.
 
-    A :class:`~torchrl.modules.ProbabilisticActor` in all respects, whose call does without the
-    bookkeeping between its two modules, which takes four times as long as all else. It draws the
-    same actions from the same random numbers.
+    A :class:`~torchrl.modules.ProbabilisticActor` in all respects, but its call skips the
+    bookkeeping between its two modules, which takes four times as long as everything else. It draws
+    the same actions from the same random numbers.
 
     Args:
         policy: shared, not copied.
         action_key: key of the action.
         log_prob_key: key of the logarithm of the action's density; not written if ``None``.
-        bounds: where the action is clipped; not at all if ``None``. Distribution and density
+        bounds: bounds to which the action is clipped; none if ``None``. Distribution and density
             remain those of the action before clipping.
 
     Examples:
@@ -176,7 +177,7 @@ class GaussianActor(ProbabilisticActor):
         loc, scale = policy(tensordict.get("observation"))
         action = loc
         if drawn:
-            # As torch.distributions does, to the bit.
+            # Bit for bit as torch.distributions does.
             action = loc + torch.randn(loc.shape, dtype=loc.dtype, device=loc.device) * scale
         tensordict.set("loc", loc)
         tensordict.set("scale", scale)
@@ -200,13 +201,13 @@ def make_actor(
 
 
 def acting(policy: GaussianPolicy, task: AnyTask, clip: bool = True) -> TensorDictModuleBase:
-    """What acts on the real system: the policy's actor, its actions clipped to the task's bounds.
+    """The actor for the real system: the policy's, with actions clipped to the task's bounds.
 
-    Both arms of a comparison, with and without L1, act and store clipped actions.
+    Both arms of a comparison, with and without L1, use and store clipped actions.
 
     Args:
         policy: shared, not copied.
-        task: for the bounds.
+        task: provides the bounds.
         clip: whether to clip.
 
     Raises:
@@ -227,7 +228,7 @@ def acting(policy: GaussianPolicy, task: AnyTask, clip: bool = True) -> TensorDi
 
 
 def kinds_of(policy: TensorDictModuleBase) -> tuple[str, ...]:
-    """The ways to act that differ: both for a distribution over actions, else ``stochastic``.
+    """The distinct ways to act: both for a distribution over actions, otherwise ``stochastic``.
 
     Examples:
         >>> from tensordict.nn import TensorDictModule

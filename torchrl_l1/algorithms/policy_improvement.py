@@ -37,12 +37,12 @@ POLICY_METRICS: dict[str, str] = {
     "trpo/improvement": "Mean gain of the surrogate per TRPO step.",
     "trpo/accepted": "Share of TRPO steps whose line search succeeded.",
 }
-"""What the policy's improvement reports: all TRPO steps of an outer iteration."""
+"""Metrics of the policy's improvement: all TRPO steps of an outer iteration."""
 
 
 @dataclass
 class PolicyStep:
-    """One TRPO step: its report, and what the trajectories that it learnt from were like."""
+    """One TRPO step: its report, and properties of the trajectories that it learned from."""
 
     report: TRPOReport
     imagined_return: float
@@ -50,7 +50,7 @@ class PolicyStep:
 
 
 class SeenStarts:
-    """Start states of a task that cannot be reset without stepping it: those seen so far.
+    """Start states seen so far, for a task that tells none without stepping its environment.
 
     Attributes:
         observations: first observations of real episodes ``(K, n)``, float32, as L1 and policies
@@ -69,7 +69,7 @@ class SeenStarts:
         self.observations = torch.zeros(0, 0)
 
     def see(self, data: TensorDictBase) -> None:
-        """Remember those of episodes ``[N, T]``."""
+        """Remember the start states of episodes ``[N, T]``."""
         done, observation = data["next", "done"].squeeze(-1), data["observation"].float()
         first = torch.ones_like(done)
         first[:, 1:] = done[:, :-1]
@@ -92,8 +92,8 @@ class PolicyImprovement:
         dynamics: the model.
         policy: changed in place, on the model's device.
         config: settings.
-        outcomes: rewards and ends of what is imagined.
-        penalize: changes the imagined trajectories before anything is learned from them.
+        outcomes: rewards and terminations of imagined trajectories.
+        penalize: changes the imagined trajectories before they are learned from.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class PolicyImprovement:
         self.action_low, self.action_high = action_bounds(task, self.device)
 
     def see(self, data: TensorDictBase) -> None:
-        """Remember how episodes ``[N, T]`` started, where the task does not tell how they do."""
+        """Remember the start states of episodes ``[N, T]``, if the task does not tell them."""
         if isinstance(self.start_states, SeenStarts):
             self.start_states.see(data)
 
@@ -179,7 +179,7 @@ class PolicyImprovement:
         return torch.cat(starts).to(self.device)
 
     def state_dict(self) -> dict[str, Any]:
-        """What a step leaves behind beside the policy."""
+        """The state that a step leaves besides the policy."""
         state = self.baseline.state_dict()
         if isinstance(self.start_states, SeenStarts):
             return {"baseline": state, "starts": self.start_states.observations}
@@ -195,7 +195,7 @@ class PolicyImprovement:
 def policy_metrics(steps: list[PolicyStep]) -> dict[str, float]:
     """Metrics of the policy's improvement: all TRPO steps of an outer iteration.
 
-    They are no numbers where not one step could be taken.
+    They are NaN if no step could be taken.
     """
     if not steps:
         return dict.fromkeys(POLICY_METRICS, math.nan)
@@ -210,15 +210,15 @@ def policy_metrics(steps: list[PolicyStep]) -> dict[str, float]:
     }
 
 
-# Different steps of each trajectory that the Fisher matrix is to be estimated on, at least.
+# Minimum number of different steps of each trajectory in the estimate of the Fisher matrix.
 _LEAST_STEPS = 5
 
 
 def spread_fisher(config: TRPOConfig, horizon: int) -> TRPOConfig:
-    """Settings with which the Fisher matrix is estimated on all steps of short trajectories.
+    """Settings such that the Fisher matrix is estimated on all steps of short trajectories.
 
-    Samples stand trajectory by trajectory. Of trajectories of ten steps every tenth sample is a
-    first step, whose states are alike: the step length would be that of another policy.
+    Samples are ordered by trajectory. With trajectories of ten steps, every tenth sample is a first
+    step, whose states are alike: the step length would be that of another policy.
 
     Args:
         config: settings.
@@ -247,26 +247,26 @@ def imagined_advantages(
 ) -> tuple[Tensor, Tensor]:
     """Generalized advantage estimate (arXiv 1506.02438) of trajectories that may end early.
 
-    What follows an exit from the data's box is unknown. To call it zero (``box_exit="fail"``)
-    rewards leaving wherever rewards are negative; ``"truncate"`` lets the value of the last state
-    inside stand for it. Nothing follows where the task itself ends.
+    The value after an exit from the data's box is unknown. Taking it as zero (``box_exit="fail"``)
+    rewards leaving wherever rewards are negative; ``"truncate"`` uses the value of the last state
+    inside instead. After the task itself ends, the value is zero.
 
     Args:
         trajectories: from :func:`~torchrl_l1.dynamics.imagine`, batch size ``[B, T]``.
         value: the baseline's value of each ``observation`` ``(B, T, 1)``.
-        last_value: what follows the last step ``(B, 1, 1)``: zero if the task ends there.
+        last_value: value after the last step ``(B, 1, 1)``: zero if the task ends there.
         discount: gamma.
         gae_lambda: lambda.
         box_exit: ``"truncate"`` or ``"fail"``.
 
     Returns:
-        advantages and value targets ``(B, T, 1)``; they mean nothing where ``valid`` is false.
+        advantages and value targets ``(B, T, 1)``, meaningless where ``valid`` is false.
     """
     done = trajectories["next", "done"]
     terminated = trajectories["next", "terminated"]
     if box_exit == "fail":
         terminated = terminated | trajectories["next", "left_box"]
-    # After an exit the observation stays that of the last state inside, and so does its value.
+    # After an exit the observation remains that of the last state inside, and so does its value.
     next_value = torch.cat([value[:, 1:], last_value], dim=1)
     advantage, target = generalized_advantage_estimate(
         discount,
@@ -281,6 +281,6 @@ def imagined_advantages(
 
 
 def _standardize(advantage: Tensor) -> Tensor:
-    # A single sample has no standard deviation, and tells of no direction.
+    # A single sample has no standard deviation and gives no direction.
     spread = advantage.std() if advantage.numel() > 1 else 0.0
     return (advantage - advantage.mean()) / (spread + 1e-8)

@@ -1,4 +1,4 @@
-"""Campaigns: matrices of runs and evaluations, worked off by local workers or Hydra launchers."""
+"""Campaigns: matrices of runs and evaluations, executed by local workers or Hydra launchers."""
 
 from torchrl_l1.campaign.description import (
     Campaign,

@@ -1,6 +1,6 @@
-"""The processes that a campaign starts: to train, to evaluate, or to launch a sweep.
+"""The processes that a campaign starts to train, to evaluate or to launch a sweep.
 
-Not for users: they end when the campaign's own process, PARENT, ends, however it does.
+Not for users: they end when the campaign's own process, PARENT, ends in any way.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ _PR_SET_PDEATHSIG = 1
 
 
 def end_with(parent: int) -> None:
-    """Let the system kill this process when its parent ends. Linux only; elsewhere it lives on.
+    """Have the system kill this process when its parent ends. Linux only; elsewhere it continues.
 
-    A run that lives on holds its run directory, and the campaign waits for it when it is
+    A run that continues keeps its run directory locked, and the campaign waits for it when
     started again. Nothing is lost either way: all files are replaced atomically.
     """
     if not sys.platform.startswith("linux"):
         return
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent:  # it ended before the system was told
+    if os.getppid() != parent:  # the parent ended before this took effect
         sys.exit("the campaign has ended")
 
 
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def train(settings: Mapping[str, Any]) -> None:
-    """Train or go on as the campaign has planned it, whatever has become of the recipe since.
+    """Train or resume as planned by the campaign, even if the recipe has changed since.
 
     Exits with the status ``TEMPORARY_FAILURE`` if another process is running in the run directory.
     """

@@ -1,4 +1,4 @@
-"""``torchrl-l1 campaign``: run a matrix of runs and their evaluations, or say how far they are."""
+"""``torchrl-l1 campaign``: run a matrix of runs and their evaluations, or show their progress."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> N
     """``torchrl-l1 campaign``. Exits with a non-zero status if a run failed or it was stopped.
 
     Raises:
-        CampaignError: if the campaign cannot run as asked; nothing has been started then.
+        CampaignError: if the campaign cannot run as requested; nothing is started in this case.
         RunDirectoryError: if a run directory holds a run of another configuration.
     """
     if options.workers is not None and options.workers < 1:
         raise CampaignError(f"--workers must be at least 1, got {options.workers}")
     for_hydra = [text for text in overrides if override_key(text).split(".")[0] == "hydra"]
     if for_hydra and not options.launcher:
-        raise CampaignError(f"{for_hydra[0]} is for Hydra's launchers; give --launcher as well")
+        raise CampaignError(f"{for_hydra[0]} is for Hydra's launchers; also give --launcher")
     if options.launcher:
         check_launcher(options.launcher)
     ours = [text for text in overrides if text not in for_hydra]
@@ -50,18 +50,18 @@ def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> N
         ) from error
     if "${" in str(output):
         raise CampaignError(
-            f"{output}: ${{ in a path stands for a setting in the settings of its runs; choose "
-            "another --output"
+            f"{output}: ${{ in a path would be read as an interpolation in the runs' settings; "
+            "choose another --output"
         )
     _check_owner(output, campaign)
-    # Runs that are reused need no device and no dataset, which are checked once these are known.
+    # Reused runs need no device and no dataset, which are checked once these runs are known.
     runs = plan(campaign, output, trusted=options.trust)
     begun = [run for run in runs if run.directory.config_file.exists()]
     changed = {n for run in begun for n in run.directory.changed_files(run.settings(), data=True)}
     for name in sorted(changed):
         print(
-            f"{name} has changed since runs in {output} began, which stay as they are; with "
-            "another --output all are trained anew",
+            f"{name} has changed since runs in {output} began, which are kept as they are; use "
+            "another --output to train all again",
             file=sys.stderr,
         )
     reused = find_reusable(runs, output, [Path(folder) for folder in options.reuse])
@@ -88,7 +88,7 @@ def campaign_command(options: argparse.Namespace, overrides: Sequence[str]) -> N
                 runs_here = runs
             failures += work_on_runs(runs_here, options.workers or available_cores())
         except Stopped as stopped:
-            print(f"{stopped}; the same command goes on from there", file=sys.stderr)
+            print(f"{stopped}; the same command continues from there", file=sys.stderr)
             sys.exit(128 + stopped.signal_number)
     for failure in failures:
         print(failure, file=sys.stderr)
@@ -106,8 +106,8 @@ def _check_owner(output: Path, campaign: Campaign) -> None:
     name = str(content.get("name")) if isinstance(content, dict) else file.name
     if name != campaign.name:
         raise CampaignError(
-            f"{output} belongs to another campaign, {name}; give {campaign.name} a folder of its "
-            "own with --output"
+            f"{output} belongs to another campaign, {name}; give {campaign.name} its own folder "
+            "with --output"
         )
 
 

@@ -1,4 +1,4 @@
-"""What a campaign is made of, and reading it from a YAML file."""
+"""The parts of a campaign, and reading it from a YAML file."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from torchrl_l1.experiment.settings import NAMING_KEYS
 
 
 class _Loader(yaml.SafeLoader):
-    """The safe loader, with Hydra's idea of what a boolean is."""
+    """The safe loader, with booleans as in Hydra."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Refuse a key that stands twice: one of them would be lost without a word."""
+        """Refuse a duplicate key: one of the two would be lost silently."""
         seen: set[str] = set()
         for key, _ in node.value:
             if key.value in seen:
                 raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key.value!r} stands twice", key.start_mark
+                    None, None, f"the key {key.value!r} appears twice", key.start_mark
                 )
             seen.add(key.value)
         mapping: dict[Any, Any] = super().construct_mapping(node, deep)
         return mapping
 
 
-# YAML 1.1 takes yes, no, on and off for booleans, l1: [off, paper] for [False, 'paper'], and
-# 1e-3 for a word.
+# YAML 1.1 reads yes, no, on and off as booleans, so l1: [off, paper] as [False, 'paper'], and
+# 1e-3 as a string.
 _BOOL, _FLOAT = "tag:yaml.org,2002:bool", "tag:yaml.org,2002:float"
 _Loader.yaml_implicit_resolvers = {
     letter: [entry for entry in entries if entry[0] not in (_BOOL, _FLOAT)]
@@ -71,7 +71,7 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _integer)
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes the words that either kind of loader would take for something else."""
+    """Quotes the words that either kind of loader would misread."""
 
 
 _Dumper.add_implicit_resolver(_FLOAT, _FLOAT_WORDS, list("-+.0123456789"))
@@ -82,11 +82,11 @@ def load_yaml(file: Path) -> Any:
 
     Raises:
         OSError: if it cannot be read.
-        ValueError: if it is no YAML, with the place, or too large.
+        ValueError: if it is not YAML, naming the place, or is too large.
     """
     try:
         return yaml.load(yaml_text(file), _Loader)
-    # Tags with impossible values and keys that are lists have errors of their own.
+    # Tags with impossible values and keys that are lists raise other errors.
     except (yaml.YAMLError, RecursionError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{file} is not valid YAML: {problem(error)}") from error
 
@@ -103,29 +103,29 @@ def dump_yaml(content: Any) -> str:
     return str(yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True))
 
 
-# What may become part of a path and of a Hydra override without quotes.
+# Texts that can be part of a path and of a Hydra override without quotes.
 _PLAIN = re.compile(r"[A-Za-z0-9_.+-]{1,100}")
-# Names of environments and functions; in a path, underscores stand for what separates folders.
+# Names of environments and functions; in a path, underscores replace separators.
 _NAME_OF_CODE = re.compile(r"[A-Za-z0-9_.+:/-]{1,200}")
-# Keys too; a group may be below another one.
+# Keys likewise; a group may be nested in another.
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:[./@-][A-Za-z0-9_]+)*")
-# Of a campaign, whose default is that of a user's file.
+# Names of campaigns, by default that of the user's file.
 _NAME = re.compile(r"[\w+][\w.+=, -]{0,99}")
-# What a value of a matrix may be.
+# Types of the values of a matrix.
 _PLAIN_VALUES = (str, bool, int, float)
 _RESERVED = ("run_dir", "resume")
 
 
 class CampaignError(ValueError):
-    """A campaign cannot be run as asked; the message says where the fault lies."""
+    """A campaign cannot be run as requested; the message locates the problem."""
 
 
 @dataclass
 class RunMatrix:
-    """Runs of one recipe: every combination of the matrix' values.
+    """Runs of one recipe: every combination of the matrix's values.
 
     Attributes:
-        recipe: a shipped recipe, or a YAML file of the user's, found from the campaign file.
+        recipe: a shipped recipe, or the user's own YAML file, relative to the campaign file.
         overrides: Hydra overrides for all of these runs.
         matrix: values by key; a key is a recipe group or a setting. ``seed`` is ``[0]`` if absent.
     """
@@ -144,24 +144,24 @@ class RunMatrix:
             raise CampaignError(f"matrix must map keys to lists of values, got {self.matrix!r}")
         for key, values in self.matrix.items():
             if not _KEY.fullmatch(str(key)) or len(str(key)) > 100:
-                raise CampaignError(f"matrix: {key!r} is no key of a recipe")
+                raise CampaignError(f"matrix: {key!r} is not a key of a recipe")
             _check_list(f"matrix.{key}", values, _PLAIN_VALUES, filled=True)
             texts = [value_text(value) for value in values]
             for text in texts:
                 if not (_NAME_OF_CODE if key in NAMING_KEYS else _PLAIN).fullmatch(text):
                     raise CampaignError(
-                        f"matrix.{key}: {text!r} cannot name a folder; give a word or a number, "
-                        "and move what all runs share to overrides"
+                        f"matrix.{key}: {text!r} cannot name a folder; use a word or a number, and "
+                        "move settings that all runs share to overrides"
                     )
             if len(set(map(path_text, texts))) < len(texts):
-                raise CampaignError(f"matrix.{key} names a value twice: {', '.join(texts)}")
+                raise CampaignError(f"matrix.{key} repeats a value: {', '.join(texts)}")
         for key in [*self.matrix, *map(override_key, self.overrides)]:
             if key in _RESERVED:
                 raise CampaignError(f"{key} is set by the campaign itself; leave it out")
         for key in map(override_key, self.overrides):
             if key in self.matrix:
                 raise CampaignError(
-                    f"{key} is set by overrides and by the matrix; leave one of them out"
+                    f"{key} is set both by overrides and by the matrix; leave one of them out"
                 )
         seeds = {"seed": self.matrix.get("seed", [0])}
         if any(not isinstance(seed, int) or isinstance(seed, bool) for seed in seeds["seed"]):
@@ -174,16 +174,16 @@ class EvaluationSettings:
     """An evaluation of frozen policies, for each finished run that matches.
 
     Attributes:
-        name: of the table ``RUN_DIR/evaluations/NAME.csv``.
-        where: values that a run must have, by matrix key (or ``recipe``); no key, every run.
+        name: name of the table ``RUN_DIR/evaluations/NAME.csv``.
+        where: values that a run must have, by matrix key (or ``recipe``); every run if empty.
         matrix: what is varied: values by the names of :func:`~torchrl_l1.experiment.matrix.axes`,
-            which are keys of the campaign file beside the others. Where none are given they are
-            those of the axis. For ``epsilon`` and ``alpha`` a number or null will do. A planner,
-            which acts in one way only, is tested once whatever ``policy`` says.
+            which are keys of the campaign file beside the others. By default they are those of the
+            axis. ``epsilon`` and ``alpha`` may also be a single number or null. A planner, which
+            acts in only one way, is tested once whatever ``policy`` is.
         episodes: episodes per cell.
         seed: seed of resets, noise and sampled actions.
-        suite: name of a suite of disturbances, in place of values of them. With it, ``l1`` is
-            ``[off, paper, robust, oracle]`` if it is not given.
+        suite: name of a suite of disturbances, instead of their values. With it, ``l1`` defaults
+            to ``[off, paper, robust, oracle]``.
     """
 
     name: str
@@ -218,7 +218,7 @@ class EvaluationSettings:
 
     @staticmethod
     def keys() -> list[str]:
-        """The keys in a campaign file, in the order in which they are written."""
+        """The keys in a campaign file, in their written order."""
         varied = [axis.name for axis in axes()]
         how_many = 1 + varied.index("policy")
         rest = ["episodes", "seed", *varied[how_many:], "suite"]
@@ -226,7 +226,7 @@ class EvaluationSettings:
 
     @classmethod
     def from_keys(cls, **entry: Any) -> EvaluationSettings:
-        """From the :meth:`keys` of a campaign file, those of the matrix beside the others.
+        """Build from the :meth:`keys` of a campaign file, in which the matrix's are not nested.
 
         Raises:
             CampaignError: for a value of the wrong kind.
@@ -235,20 +235,20 @@ class EvaluationSettings:
         varied = {axis.name for axis in axes()}
         rest = {key: value for key, value in entry.items() if key not in varied}
         if "matrix" in rest:
-            raise TypeError("matrix is no key of an evaluation")
+            raise TypeError("matrix is not a key of an evaluation")
         return cls(**rest, matrix={key: entry[key] for key in entry if key in varied})
 
     def to_keys(self) -> dict[str, Any]:
-        """The :meth:`keys` with their values."""
+        """Values by :meth:`keys`."""
         values = {**vars(self), **self.matrix}
         return {key: values[key] for key in self.keys()}
 
     def conditions(self) -> list[Condition]:
-        """What is tested, in the order of the table."""
+        """The tested conditions, in the order of the table."""
         return conditions(self.suite, **self.matrix)
 
     def of_a_run(self) -> dict[str, Any]:
-        """What the table of a single run depends on: all keys but ``name`` and ``where``."""
+        """The keys that the table of a single run depends on: all but ``name`` and ``where``."""
         settings = self.to_keys()
         del settings["name"], settings["where"]
         return settings
@@ -260,7 +260,7 @@ class Campaign:
 
     Attributes:
         name: the name of the campaign.
-        file: where it was read from.
+        file: the file it was read from.
         description: one line.
         runs: matrices of runs.
         evaluations: evaluations of the finished runs.
@@ -306,7 +306,7 @@ def override_key(override: str) -> str:
 
 
 def _axis_values(axis: Axis, given: Mapping[str, Any]) -> list[Any]:
-    """The values of an axis: text, or numbers; some axes may be left to the run."""
+    """The values of an axis: texts or numbers; some axes may be left to the run."""
     values = given.get(axis.name, list(axis.values))
     if axis.kind is float and not axis.values:
         return _numbers(axis.name, values)
@@ -318,7 +318,7 @@ def _axis_values(axis: Axis, given: Mapping[str, Any]) -> list[Any]:
 
 
 def _numbers(key: str, value: Any) -> list[float]:
-    """Null, a number or a list of numbers as a list."""
+    """A list from null, a number or a list of numbers."""
     values = [] if value is None else value if isinstance(value, list) else [value]
     if any(isinstance(one, bool) or not isinstance(one, (int, float)) for one in values):
         raise CampaignError(f"{key} must be null, a number or a list of numbers, got {value!r}")
@@ -329,21 +329,21 @@ def _check_list(key: str, values: Any, kinds: tuple[type, ...], filled: bool = F
     if not isinstance(values, list) or (filled and not values):
         raise CampaignError(f"{key} must be a list{' of values' * filled}, got {values!r}")
     for value in values:
-        # To Python a truth value is a whole number, too.
+        # In Python, a bool is an int too.
         if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-            raise CampaignError(f"{key} holds {value!r}, which is no plain value of its kind")
+            raise CampaignError(f"{key} holds {value!r}, which has the wrong type")
 
 
 T = TypeVar("T")
 
 
 def read_campaign(name: str, overrides: Sequence[str] = (), *, trusted: bool = False) -> Campaign:
-    """Read a shipped campaign or a YAML file of the user's.
+    """Read a shipped campaign or the user's own YAML file.
 
     Args:
         name: such as ``table1``, or a path that ends in ``.yaml``.
-        overrides: Hydra overrides for all runs; they replace those of the file with the same key.
-        trusted: whether the file may set up Hydra itself, which may run any code.
+        overrides: Hydra overrides for all runs; they replace those with the same key in the file.
+        trusted: whether the file may configure Hydra itself, which may run arbitrary code.
 
     Raises:
         RecipeError: if there is no such campaign.
@@ -376,8 +376,8 @@ def read_campaign(name: str, overrides: Sequence[str] = (), *, trusted: bool = F
         for key in [*matrix.matrix, *map(override_key, matrix.overrides)]:
             if re.match(r"hydra\b", key) and not trusted:
                 raise CampaignError(
-                    f"{file}: runs[{i}]: {key} sets up Hydra, by which any code may be run; leave "
-                    "it out, or say --trust if the file is yours"
+                    f"{file}: runs[{i}]: {key} configures Hydra, which may run arbitrary code; "
+                    "leave it out, or give --trust if the file is yours"
                 )
         try:
             runs[i] = RunMatrix(
@@ -399,8 +399,8 @@ def read_campaign(name: str, overrides: Sequence[str] = (), *, trusted: bool = F
     title = content.get("name", file.stem)
     if not isinstance(title, str) or not _NAME.fullmatch(title):
         raise CampaignError(
-            f"{file}: name must be letters, digits, spaces and . + = , - that begin with a letter, "
-            f"at most 100, since it names a folder; got {title!r}"
+            f"{file}: name must begin with a letter and have at most 100 letters, digits, spaces "
+            f"and . + = , - because it names a folder; got {title!r}"
         )
     return Campaign(title, file, str(content.get("description", "")), runs, evaluations)
 

@@ -1,4 +1,4 @@
-"""The evaluations of a campaign: one table for each run, with its settings beside it."""
+"""The evaluations of a campaign: one table per run, with its settings beside it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from torchrl_l1.experiment.tracking import Evaluated, log_evaluation
 
 
 def evaluation_file(run_dir: Path, name: str) -> Path:
-    """The table of an evaluation; its settings have the suffix ``.yaml``.
+    """The table of an evaluation; the file of its settings has the suffix ``.yaml``.
 
     The returns of single episodes are in :func:`episodes_file`.
     """
@@ -30,9 +30,9 @@ def evaluation_file(run_dir: Path, name: str) -> Path:
 
 
 def is_evaluated(directory: RunDirectory, settings: EvaluationSettings) -> bool:
-    """Whether the table is there as it was written, made with these settings after all iterations.
+    """Whether there is an intact table, made with these settings after all iterations.
 
-    Settings that its description does not mention, since it is older than they are, have their
+    Settings that are missing from its description, because it is older than they are, have their
     defaults.
     """
     table = evaluation_file(directory.path, settings.name)
@@ -54,9 +54,9 @@ def is_evaluated(directory: RunDirectory, settings: EvaluationSettings) -> bool:
 
 
 def _described(settings: EvaluationSettings, iterations: int) -> dict[str, Any]:
-    """What a table was made from: settings, and how many outer iterations the run had.
+    """What a table was made from: settings, and the run's number of outer iterations.
 
-    Of a suite it says the disturbances, too: they may be others in another version.
+    For a suite it lists the disturbances, which may differ in another version.
     """
     cells = {} if settings.suite is None else {"disturbances": suite(settings.suite)}
     return {**settings.of_a_run(), **cells, "iterations": iterations}
@@ -67,15 +67,15 @@ def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
 
     Args:
         run_dir: the run directory.
-        name: of the evaluation.
-        settings: as :meth:`EvaluationSettings.of_a_run` gives them.
+        name: name of the evaluation.
+        settings: as returned by :meth:`EvaluationSettings.of_a_run`.
 
     Returns:
-        the table; that of the single episodes is :func:`episodes_file` of it.
+        the table; that of the single episodes is its :func:`episodes_file`.
 
     Raises:
         RunDirectoryError: if the directory holds no run or no checkpoint.
-        ValueError: for a stage that the run has not; nothing is changed then.
+        ValueError: for a stage that the run does not have; nothing is changed in this case.
     """
     chosen = EvaluationSettings.from_keys(name=name, **settings)
     table = evaluation_file(Path(run_dir), name)
@@ -92,12 +92,12 @@ def evaluate_run(run_dir: str, name: str, settings: Mapping[str, Any]) -> Path:
     described = table.with_suffix(".yaml")
     singly = episodes_file(table)
     singly.parent.mkdir(parents=True, exist_ok=True)
-    # In this order: no kill leaves a table beside the settings of another one, or beside none.
+    # In this order, no kill leaves a table beside another table's settings, or without any.
     table.unlink(missing_ok=True)
     described.unlink(missing_ok=True)
     write_table(singly, episodes)
     write_table(table, rows)
-    # Before its settings: what a kill comes between is made, and logged, again.
+    # Before its settings: after a kill in between, the evaluation is made and logged again.
     log_evaluation(trained.recipe, trained.path, Evaluated(f"evaluations/{name}", rows))
     words = _described(chosen, trained.algorithm.iteration)
     write_atomically(described, dump_yaml({**words, "checksums": table_checksums(table)}))

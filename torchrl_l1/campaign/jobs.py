@@ -1,4 +1,4 @@
-"""What a campaign's workers do: runs, the evaluations of those that are finished, or sweeps."""
+"""The work of a campaign: runs, evaluations of finished runs, or sweeps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _PLUGINS = {
 }
 LAUNCHERS = (*_PLUGINS, "basic")
 
-# How many runs at a time, where the launcher has a setting for that.
+# The setting for the number of parallel runs, if a launcher has one.
 _WORKERS = {"joblib": "n_jobs", "submitit_slurm": "array_parallelism"}
 
 
@@ -33,8 +33,7 @@ def check_launcher(launcher: str) -> None:
     """Make sure that a launcher exists and is installed.
 
     Raises:
-        CampaignError: if it is not, with the launchers that there are or the command that
-            installs it.
+        CampaignError: if it is not, naming the known launchers or the command that installs it.
     """
     if launcher not in LAUNCHERS:
         raise CampaignError(f"unknown launcher {launcher!r}; there are {', '.join(LAUNCHERS)}")
@@ -61,16 +60,16 @@ def sweep(
 ) -> list[str]:
     """The arguments of ``torchrl-l1`` that run a matrix as one Hydra sweep.
 
-    The run directories are those of the campaign's own workers: Hydra lists the overrides of each
-    job in the order of the command line, which is that of the matrix.
+    The run directories are the same as those of the campaign's own workers: Hydra lists the
+    overrides of each job in the order of the command line, which is that of the matrix.
 
     Args:
         matrix: the runs.
         output: folder of the campaign.
         launcher: its name, as in ``hydra/launcher=NAME``.
-        workers: runs at a time; the launcher's own default if ``None``.
+        workers: number of parallel runs; the launcher's own default if ``None``.
         settings: further overrides of Hydra's settings, such as a Slurm partition.
-        logs: folder of Hydra's own files below ``output / "launcher"``.
+        logs: folder for Hydra's own files, below ``output / "launcher"``.
 
     Examples:
         >>> matrix = RunMatrix("metrpo/half_cheetah", [], {"l1": ["off", "paper"], "seed": [0, 1]})
@@ -114,15 +113,15 @@ def elsewhere(launcher: str) -> bool:
 
 
 def side_by_side(launcher: str) -> bool:
-    """Whether sweeps may run at the same time: if a scheduler shares out the machines."""
+    """Whether sweeps may run at the same time: if a scheduler assigns the machines."""
     return launcher not in ("joblib", "basic")
 
 
 def work_on_runs(runs: Sequence[PlannedRun], workers: int) -> list[Failure]:
-    """Bring each run to its end and evaluate it; what is done already is skipped.
+    """Finish and evaluate each run, skipping what is already done.
 
     Returns:
-        the processes that failed; the others went on.
+        the processes that failed; the others continued.
     """
     progress = Progress(runs)
 
@@ -169,7 +168,7 @@ def launch_runs(
         output: its folder.
         runs: its runs.
         launcher: its name, as in ``hydra/launcher=NAME``.
-        workers: runs at a time; the launcher's own default if ``None``.
+        workers: number of parallel runs; the launcher's own default if ``None``.
         settings: overrides of Hydra's own settings.
 
     Returns:

@@ -1,4 +1,4 @@
-"""From a campaign file to its runs: every setting known, every mistake found, nothing started."""
+"""From a campaign file to its runs: settings composed and mistakes found before anything starts."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ class PlannedRun:
         matrix: the position of its matrix in the campaign.
         round: the position of its seed in the matrix.
         directory: its run directory.
-        config: composed, with seed and run directory.
-        evaluations: what is to be evaluated once it is finished.
+        config: the composed configuration, with seed and run directory.
+        evaluations: the evaluations to make once it is finished.
     """
 
     values: dict[str, str]
@@ -69,11 +69,11 @@ class PlannedRun:
 
     @property
     def iterations(self) -> int:
-        """Outer iterations in all."""
+        """Total number of outer iterations."""
         return int(self.config.outer_iterations)
 
     def collected_steps(self, iterations: int) -> int:
-        """Real steps that so many outer iterations collect; random data do not count."""
+        """Number of real steps in so many outer iterations; random data do not count."""
         full = self.config.horizon or self.task.horizon
         steps = episode_length(self.config.get("episode_steps"), full)
         return self._recipe.collected_episodes(iterations) * steps
@@ -83,7 +83,7 @@ class PlannedRun:
         return self._recipe.stages()
 
     def check_controllers(self, cells: Sequence[Condition]) -> None:
-        """Refuse values that a controller does not have that is to be tested.
+        """Refuse values that a tested controller does not take.
 
         Raises:
             ValueError: naming the controller.
@@ -92,7 +92,7 @@ class PlannedRun:
 
     @cached_property
     def task(self) -> AnyTask:
-        """What the run is about."""
+        """The task of the run."""
         return self._recipe.real_task()
 
     @cached_property
@@ -102,11 +102,11 @@ class PlannedRun:
         return recipe
 
     def iterations_done(self) -> int:
-        """Outer iterations so far; all of them only once the run is sure to be finished."""
+        """Outer iterations so far; all of them only once the run is certainly finished."""
         return min(self.directory.iterations_done(), self.iterations)
 
     def finished(self) -> bool:
-        """Whether all outer iterations are done, and their files are as they were written."""
+        """Whether all outer iterations are done and their files are intact."""
         return self.iterations_done() >= self.iterations and self.directory.intact()
 
     def settings(self) -> dict[str, Any]:
@@ -115,7 +115,7 @@ class PlannedRun:
         return {str(key): value for key, value in settings.items()}
 
     def check_directory(self) -> None:
-        """Make sure that the run directory, if it holds a run, holds this one.
+        """Make sure that the run directory holds no other run.
 
         Raises:
             RunDirectoryError: if it holds a run of another configuration.
@@ -126,12 +126,12 @@ class PlannedRun:
             self.directory.check_same(self.settings())
         except RunDirectoryError as error:
             raise RunDirectoryError(
-                f"{error}\nThe campaign or its recipe has changed since that run was started; with "
-                "--output the campaign gets a folder of its own."
+                f"{error}\nThe campaign or its recipe has changed since that run was started; use "
+                "--output to give the campaign its own folder."
             ) from error
 
     def problem(self) -> str | None:
-        """What keeps the run from being finished as planned; ``None`` if it is."""
+        """Why the run is not finished as planned; ``None`` if it is."""
         if not self.finished():
             done = self.iterations_done()
             if done >= self.iterations:
@@ -145,7 +145,7 @@ class PlannedRun:
 
 
 def recipe_name(recipe: str) -> str:
-    """The name of a recipe, for folders and for ``where``: that of the file if it is a user's."""
+    """The name of a recipe for folders and ``where``; of a user's recipe, that of its file."""
     return Path(recipe).stem if recipe.endswith(".yaml") else recipe
 
 
@@ -160,15 +160,15 @@ def quoted(path: Path) -> str:
 
 
 def plan(campaign: Campaign, output: Path, *, trusted: bool = False) -> list[PlannedRun]:
-    """All runs of a campaign, in the order in which they are to be started.
+    """All runs of a campaign, in the order in which to start them.
 
-    The first seed of every cell comes before the second of any, so that a campaign that is
-    stopped early has compared everything with everything.
+    The first seed of every cell comes before the second of any, so that a campaign stopped early
+    still compares all cells.
 
     Args:
         campaign: the campaign.
         output: its folder.
-        trusted: whether recipes of the user's may set up Hydra itself.
+        trusted: whether the user's recipes may configure Hydra itself.
 
     Raises:
         CampaignError: for an unknown recipe or option, a setting out of range, an evaluation that
@@ -184,8 +184,8 @@ def plan(campaign: Campaign, output: Path, *, trusted: bool = False) -> list[Pla
     for path, count in Counter(run.directory.path for run in runs).items():
         if count > 1:
             raise CampaignError(
-                f"{campaign.file}: {count} runs would share {path}; let a key of their matrices "
-                "tell them apart"
+                f"{campaign.file}: {count} runs would share {path}; distinguish them by a key of "
+                "their matrices"
             )
     _add_evaluations(campaign, runs)
     for run in runs:
@@ -194,14 +194,14 @@ def plan(campaign: Campaign, output: Path, *, trusted: bool = False) -> list[Pla
 
 
 def cells(matrix: RunMatrix) -> Iterator[dict[str, str]]:
-    """Every combination of a matrix' values but the seed, as texts by key."""
+    """Every combination of a matrix's values except the seed, as texts by key."""
     keys = [key for key in matrix.matrix if key != "seed"]
     for values in product(*(matrix.matrix[key] for key in keys)):
         yield dict(zip(keys, map(value_text, values), strict=True))
 
 
 def levels(matrix: RunMatrix) -> list[list[str]]:
-    """Names of folders, level by level: below the campaign's a run's path is one of each.
+    """Names of folders, level by level: a run's path below the campaign's has one of each.
 
     Examples:
         >>> levels(RunMatrix("pets/swimmer", matrix={"l1": ["off", "paper"]}))
@@ -239,27 +239,27 @@ def _check(config: DictConfig) -> None:
     recipe = OmegaConf.to_object(config)
     assert isinstance(recipe, RunSettings)
     check_loggers(recipe)
-    # What is drawn for weights is of no use; the global numbers go on as if nothing had been.
+    # Weights drawn here are not used; the global generator is left untouched.
     with fork_rng(devices=[]), single_precision(), fitting_into_memory(recipe.recipe):
         recipe.build_on_cpu()
 
 
 def _check_varied(matrix: RunMatrix, config: DictConfig) -> None:
-    """Refuse settings of L1 that tell runs without it apart: those would all be the same."""
+    """Refuse settings of L1 that would distinguish runs without it: they would all be the same."""
     for key, values in matrix.matrix.items():
         of_l1 = key.startswith("l1.") and key != "l1.enabled"
         if of_l1 and len(values) > 1 and not config.l1.enabled:
             raise CampaignError(
-                f"matrix.{key} changes nothing while L1 is off: turn it on by l1=paper in "
-                "overrides, or give the runs without L1 a matrix of their own"
+                f"matrix.{key} has no effect while L1 is off: turn it on with l1=paper in "
+                "overrides, or move the runs without L1 to another matrix"
             )
 
 
 def check_machine(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
-    """Make sure that this machine can train the runs that are not finished.
+    """Make sure that this machine can train the unfinished runs.
 
     Raises:
-        CampaignError: if a device or a dataset is not there.
+        CampaignError: if a device or a dataset is missing.
     """
     for run in runs:
         if run.finished():
@@ -293,18 +293,18 @@ def _add_evaluations(campaign: Campaign, runs: Sequence[PlannedRun]) -> None:
             texts = set(map(value_text, values))
             chosen = [run for run in chosen if run.values.get(key) in texts]
         if not chosen:
-            raise CampaignError(f"{place}: no run has all of where")
+            raise CampaignError(f"{place}: no run matches all of where")
         for run in chosen:
             _check_stages(place, run, settings.matrix["stage"])
             try:
                 run.check_controllers(settings.conditions())
-                if settings.suite is None:  # of a suite, what cannot act is left out
+                if settings.suite is None:  # disturbances of a suite that cannot act are left out
                     check_plants(run.task, settings.conditions())
             except ValueError as error:
                 raise CampaignError(f"{place}: {error}") from error
             if any(other.name == settings.name for other in run.evaluations):
                 raise CampaignError(
-                    f"{place}: another evaluation of this name is for {run} too; give it another "
+                    f"{place}: another evaluation of this name is also for {run}; give it another "
                     "name or a narrower where"
                 )
             run.evaluations.append(settings)

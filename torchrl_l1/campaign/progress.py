@@ -1,4 +1,4 @@
-"""How far a campaign is: a table of its runs, a bar, and a line for each finished run."""
+"""The progress of a campaign: a table of its runs, a bar, and a line per finished run."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def state(run: PlannedRun) -> str:
 
 
 def overview(runs: Sequence[PlannedRun], reused: Mapping[Path, Path] | None = None) -> str:
-    """All runs with their states, a line for each, and a sum.
+    """All runs with their states, a line for each, and a summary.
 
     Args:
-        runs: the campaign's.
-        reused: where the finished run is that would be copied, by run directory.
+        runs: the campaign's runs.
+        reused: the finished run that would be copied, by run directory.
     """
     sources = [(reused or {}).get(run.directory.path) for run in runs]
     states = ["reused" if source else state(run) for run, source in zip(runs, sources, strict=True)]
@@ -63,7 +63,7 @@ def overview(runs: Sequence[PlannedRun], reused: Mapping[Path, Path] | None = No
 
 
 def result(run: PlannedRun) -> str:
-    """Where a finished run has got to, from the last line of its metrics."""
+    """The result of a finished run, from the last line of its metrics."""
     with run.directory.metrics_file.open(encoding="utf-8", newline="") as file:
         last = list(csv.DictReader(file))[-1]
     return (
@@ -74,9 +74,10 @@ def result(run: PlannedRun) -> str:
 
 
 class Progress:
-    """A bar over the real steps of all runs, which reads the runs' own tables.
+    """A progress bar over the real steps of all runs, read from the runs' own tables.
 
-    Iterations of different tasks take different times; time goes more with the real steps.
+    Iterations of different tasks take different times; time is closer to proportional to real
+    steps.
 
     Args:
         runs: all runs of the campaign.
@@ -91,7 +92,7 @@ class Progress:
         self._first = self._steps_done()
         self._total = sum(run.collected_steps(run.iterations) for run in runs)
         self._next = 0.0
-        # No smoothing: steps of different tasks take different times, the mean is steadier.
+        # No smoothing: steps of different tasks take different times, and the mean is steadier.
         self._bar = tqdm(
             total=self._total,
             initial=self._first,
@@ -102,7 +103,7 @@ class Progress:
         )
 
     def tick(self, running: int) -> None:
-        """Look at the runs again, if it is time to."""
+        """Read the runs' tables again, if it is time to."""
         if time.monotonic() < self._next:
             return
         self._next = time.monotonic() + REFRESH_SECONDS
@@ -117,14 +118,14 @@ class Progress:
         self._bar.write(line)
 
     def finished(self, run: PlannedRun) -> None:
-        """A run has ended well: print its result and an estimate of the time left."""
+        """Report a successful run: print its result and an estimate of the time left."""
         self._done[id(run)] = run.iterations
         self._ended.add(id(run))
         count = f"{len(self._ended)} of {len(self._runs)} runs"
         self.write(f"finished {run}: {result(run)}; {count}{self._time_left()}")
 
     def evaluated(self, run: PlannedRun) -> None:
-        """The evaluations of a run have ended well."""
+        """Report that the evaluations of a run have succeeded."""
         self._to_evaluate -= 1
         self.write(f"evaluated {run}")
 

@@ -1,4 +1,4 @@
-"""Runs that another campaign has trained with the same settings: copied, not trained again."""
+"""Reusing runs that another campaign has trained with the same settings, by copying them."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from torchrl_l1.experiment.wandb_files import ID_FILE, draw_id, known_id
 def find_reusable(
     runs: Sequence[PlannedRun], output: Path, folders: Sequence[Path]
 ) -> dict[Path, Path]:
-    """Finished runs with the settings of runs that have not begun; the first one found counts.
+    """Finished runs with the settings of runs that have not begun; the first one found is used.
 
     Args:
-        runs: the campaign's.
-        output: the campaign's folder; what is in it is no other campaign's.
-        folders: where to look, with all that is below.
+        runs: the campaign's runs.
+        output: the campaign's folder; runs in it are the campaign's own.
+        folders: folders to search, with their subfolders.
 
     Returns:
-        where the finished run is, by the run directory that is to be its copy.
+        the finished run by the run directory of its copy.
 
     Raises:
         CampaignError: if a folder does not exist.
     """
     for folder in folders:
         if not folder.is_dir():
-            hint = "; overrides stand before --reuse" if "=" in folder.name else ""
+            hint = "; overrides go before --reuse" if "=" in folder.name else ""
             raise CampaignError(f"--reuse: there is no folder {folder}{hint}")
     finished: dict[Any, list[tuple[Path, dict[str, Any]]]] = {}
     for folder in folders:
@@ -67,14 +67,14 @@ def copy_run(source: Path, run: PlannedRun) -> None:
     """Copy a finished run to where it would have been trained; a kill leaves all or nothing.
 
     Raises:
-        CampaignError: if that fails, or if the run is changed meanwhile.
+        CampaignError: if that fails, or if the run changes meanwhile.
     """
     target = run.directory.path
-    # Reports pass over hidden folders: what a kill leaves is no run.
+    # Reports skip hidden folders, so that remains of a kill do not count as a run.
     temporary = target.with_name(f".{target.name}.copy")
     try:
         shutil.rmtree(temporary, ignore_errors=True)
-        # What links lead to is copied, so that nothing is ever changed through them.
+        # Targets of links are copied, so that nothing is ever changed through them.
         shutil.copytree(source, temporary, ignore=_left, ignore_dangling_symlinks=True)
         copy = RunDirectory(temporary)
         config = read_config(copy.config_file)
@@ -94,7 +94,7 @@ def copy_run(source: Path, run: PlannedRun) -> None:
 
 
 def _left(folder: str, names: list[str]) -> set[str]:
-    """Locks, what was being written, W&B's files, links to folders, and what is no file."""
+    """Locks, unfinished files, W&B's files, links to folders, and anything but regular files."""
     # W&B knows the source by its id; the copy is another run.
     found = set(shutil.ignore_patterns(".lock", "*.tmp", ID_FILE, "wandb")(folder, names))
     for name in names:
@@ -105,8 +105,8 @@ def _left(folder: str, names: list[str]) -> set[str]:
 
 
 def _key(config: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Differs between runs that :func:`differences` tells apart, and where their code is from."""
-    # Files and modules of one name in different folders are not the same.
+    """A key to group runs by: with different keys, runs differ in settings or code."""
+    # Files and modules with the same name in different folders are not the same.
     folders = tuple(map(str, config.get("search_path") or ()))
     return *(str(config.get(key)) for key in ("task", "seed", "outer_iterations")), folders
 
@@ -116,7 +116,7 @@ def _finished(directory: RunDirectory, config: Mapping[str, Any]) -> bool:
 
 
 def _keep_evaluations(source: Path, copy: Path, wanted: Set[str]) -> None:
-    """Remove tables nobody asked for here, and the settings of one that was made again meanwhile.
+    """Remove tables that were not requested here, and settings of one remade meanwhile.
 
     A table without its settings is made again.
     """
@@ -128,7 +128,7 @@ def _keep_evaluations(source: Path, copy: Path, wanted: Set[str]) -> None:
         table = settings.with_suffix(".csv")
         names = [table.name, settings.name]
         episodes = episodes_file(table)
-        if episodes.exists():  # tables that are older have none
+        if episodes.exists():  # older tables have none
             names.append(str(episodes.relative_to(tables)))
         if filecmp.cmpfiles(source / "evaluations", settings.parent, names, False)[0] != names:
             settings.unlink()

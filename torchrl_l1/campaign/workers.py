@@ -1,4 +1,4 @@
-"""A queue of subprocesses, some of them at a time."""
+"""A queue of subprocesses, of which several run at a time."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from types import FrameType
 from torchrl_l1.experiment.errors import RunDirectoryError, message
 from torchrl_l1.experiment.files import refuse_link, write_atomically
 
-# A process that found another one at its work; EX_TEMPFAIL, a name that Windows does not have.
+# Status of a process whose work another one is doing; EX_TEMPFAIL, which Windows lacks.
 TEMPORARY_FAILURE = 75
 POLL_SECONDS = 0.1
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
 _STOPPING = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
 GRACE_SECONDS = 10.0
 _LAST_LINES = 15
-# As much as a few files of a tiny run take.
+# As much space as a few files of a tiny run.
 _ROOM = 65_536
 
 
 @dataclass
 class Job:
-    """A process to be started.
+    """A process to start.
 
     Attributes:
-        name: for messages.
-        command: what is started.
-        log: file that its output is appended to.
-        held: whether a process that is not ours is at the same work now.
-        done: called once it has ended well; what it gives is started next. It may raise
+        name: name for messages.
+        command: the command line.
+        log: file to which its output is appended.
+        held: whether a foreign process is doing the same work now.
+        done: called once it has succeeded; the jobs that it returns are started next. It may raise
             :class:`Unfinished`.
     """
 
@@ -48,15 +48,15 @@ class Job:
 
 
 class Unfinished(Exception):
-    """A process has ended well, but its work is not done; the message says what is wrong."""
+    """A process has succeeded, but its work is not done; the message says what is wrong."""
 
 
 @dataclass
 class Failure:
-    """A job that ended badly.
+    """A failed job.
 
     Attributes:
-        job: which.
+        job: the job.
         how: how it ended.
     """
 
@@ -79,14 +79,14 @@ class Failure:
         return "; ".join(parts)
 
     def _no_room(self) -> str:
-        """Why the log may lack the very reason; empty if there was room for it."""
+        """Why the log may lack the reason; empty if there was space for it."""
         probe = self.job.log.with_name(f"{self.job.log.name}.room")
         try:
             refuse_link(probe)
             write_atomically(probe, bytes(_ROOM))
             probe.unlink()
         except (OSError, RunDirectoryError) as error:
-            # The probe is gone; it is the log that has no room.
+            # The probe is gone; it is the log that has no space.
             return message(error).replace(str(probe), str(self.job.log))
         return ""
 
@@ -102,17 +102,17 @@ class Stopped(Exception):
 class Workers:
     """Runs jobs, ``count`` at a time, in the calling thread.
 
-    A process that ends with the status ``TEMPORARY_FAILURE`` has found another one at its work; it
-    is started again once that has ended.
+    A process that ends with the status ``TEMPORARY_FAILURE`` has found another one doing its work;
+    it is started again once that one has ended.
 
-    Each process has one thread and a session of its own, so that a Ctrl-C reaches the campaign
-    alone, which then ends them. It must be the main thread: on Linux the system ends the
-    processes when the thread that started them does.
+    Each process has one thread and its own session, so that Ctrl-C reaches only the campaign,
+    which then ends the processes. The calling thread must be the main one: on Linux, the system
+    ends processes together with the thread that started them.
 
     Args:
-        count: processes at a time.
-        on_tick: called again and again with the jobs that are running.
-        on_wait: called once with each job that waits for a process that is not ours.
+        count: number of parallel processes.
+        on_tick: called repeatedly with the running jobs.
+        on_wait: called once with each job that waits for a foreign process.
     """
 
     def __init__(
@@ -130,10 +130,10 @@ class Workers:
         self._stop: int | None = None
 
     def work(self, jobs: Iterable[Job]) -> list[Failure]:
-        """Run all jobs and what they lead to.
+        """Run all jobs and those that follow from them.
 
         Returns:
-            the jobs that ended badly; the others went on.
+            the failed jobs; the others continued.
 
         Raises:
             Stopped: after SIGINT, SIGTERM, SIGHUP or SIGUSR1, unless it is ignored, once every
@@ -166,7 +166,7 @@ class Workers:
                 self._queue.remove(job)
                 process = self._process(job)
             except (OSError, RunDirectoryError) as error:
-                # It cannot even have a log; the others may.
+                # Not even its log can be opened; those of others may.
                 if job in self._queue:
                     self._queue.remove(job)
                 self._failures.append(Failure(job, f"could not be started: {message(error)}"))
@@ -202,7 +202,7 @@ class Workers:
                 try:
                     self._queue.extendleft(reversed(list(job.done())))
                 except Unfinished as error:
-                    self._failures.append(Failure(job, f"ended well, but {error}"))
+                    self._failures.append(Failure(job, f"succeeded, but {error}"))
 
     def _end_all(self) -> None:
         for _, process in self._running:
@@ -224,7 +224,7 @@ class Workers:
         before = {
             number: signal.signal(number, note)
             for number in _STOPPING
-            # What is ignored, as by nohup, stays so.
+            # Ignored signals, as under nohup, stay ignored.
             if signal.getsignal(number) is not signal.SIG_IGN
         }
         try:
@@ -235,10 +235,10 @@ class Workers:
 
 
 def _end(process: subprocess.Popen[bytes], at_once: bool = False) -> None:
-    if os.name == "nt":  # there are no sessions
+    if os.name == "nt":  # this system has no sessions
         process.kill()
         return
-    # The session outlives its leader if that had children; once all are gone there is none.
+    # The session outlives a leader with children; it is gone once all processes are.
     with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL if at_once else signal.SIGTERM)
 

@@ -1,4 +1,4 @@
-"""The command ``torchrl-l1``: its subcommands, and how their errors are told."""
+"""The command ``torchrl-l1``: its subcommands, and how their errors are reported."""
 
 from __future__ import annotations
 
@@ -15,50 +15,51 @@ from torchrl_l1._version import __version__
 
 DESCRIPTION = "Robust model-based reinforcement learning with L1 adaptive control."
 
-_TRUST = "let the file set up Hydra itself, which may run any code"
+_TRUST = "let the file configure Hydra itself, which may run arbitrary code"
 
 
-# Values, and no options: of -1e-3 and -inf Python before 3.14 would say that there are none.
+# Negative numbers are values, not options: before 3.14, Python takes -1e-3 and -inf for options.
 _NEGATIVE = re.compile(r"-(?:\.?\d|inf\b|nan\b)", re.IGNORECASE)
 
 _LATER = (
     (
         "evaluate",
         "evaluate trained policies with L1 on and off under noise and disturbances",
-        "Frozen policy and model, every combination of L1 and its tuning, noise, disturbance and "
-        "stochastic or deterministic policy. Several run directories are seeds of one study.",
+        "Evaluates the frozen policy and model for every combination of L1 setting, tuning, noise, "
+        "disturbance and stochastic or deterministic policy. Several run directories are treated "
+        "as seeds of one study.",
     ),
     (
         "new-task",
-        "write a recipe for an environment of yours",
-        "Reads what an environment tells and writes a commented recipe for it.",
+        "write a recipe for your own environment",
+        "Inspects an environment and writes a commented recipe for it.",
     ),
     (
         "check",
-        "try a recipe's environment for a minute, and say what to fix",
-        "Specs, seeds, the effect of actions, reward and termination functions against the "
-        "environment, and one fit of the model.",
+        "try a recipe's environment for a minute and say what to fix",
+        "Checks specs, seeds, the effect of actions, and the reward and termination functions "
+        "against the environment, and fits the model once.",
     ),
     (
         "robustify",
-        "put L1 around a policy of any origin, and test it under disturbances",
+        "put L1 around any policy and test it under disturbances",
         "Collects data with the policy, fits a model, calibrates L1, and tests the policy under "
-        "disturbances with L1 off and on and with an oracle.",
+        "disturbances with L1 off, with L1 on and with an oracle.",
     ),
     (
         "play",
         "show a policy in a window or a film, with L1 off or on",
-        "Plays an episode of a run, of a robust controller or of a policy in its environment.",
+        "Plays one episode of a run, a robust controller or a policy in its environment.",
     ),
     (
         "export",
-        "write policy and L1 as one function of observation and state",
-        "Writes a robust controller as TorchScript, ONNX or an exported program of torch, and "
-        "compares it with the original on steps of the environment.",
+        "export policy and L1 as one function of observation and state",
+        "Writes a robust controller as TorchScript, ONNX or a torch.export program and compares "
+        "it with the original on steps of the environment.",
     ),
     (
         "dataset",
-        "record data of a run's policy, for offline learning",
+        "record data with a run's policy for offline learning",
         "Records undisturbed episodes without L1 at one of three qualities: random actions, the "
         "policy with noise, or the policy.",
     ),
@@ -66,7 +67,7 @@ _LATER = (
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Entry point of the console script. Exits with status 1 on a refused request."""
+    """Entry point of the console script. Exits with status 1 if a request is refused."""
     _print_anything()
     arguments = list(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser("torchrl-l1", description=DESCRIPTION)
@@ -76,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     _campaign_parser(commands)
     for name, words, description in _LATER:
         parts = commands.add_parser(name, help=words, description=description)
-        # What their options come with is heavy; no other command should wait for it.
+        # Their options need heavy imports, which no other command should wait for.
         if name in arguments[:1]:
             import_module(f"torchrl_l1.cli.{_module(name)}").add_arguments(parts)
     _report_parser(commands)
@@ -90,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--copy",
         nargs="+",
         metavar=("NAME", "FILE"),
-        help="write a copy to edit: of a recipe or campaign, to NAME.yaml or a file of your choice",
+        help="copy a recipe or campaign for editing, to NAME.yaml or to FILE",
     )
 
     for part in commands.choices.values():
@@ -98,16 +99,16 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         options, rest = parser.parse_known_args(arguments)
     except SystemExit:
-        _flush(" ".join(arguments[:1]))  # the help that was asked for
+        _flush(" ".join(arguments[:1]))  # the requested help
         raise
     takes_more = options.command in ("campaign", "check")
     overridden = takes_more and not any(o.startswith("-") for o in rest)
     if rest and options.command != "run" and not overridden:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     if options.command == "check":
-        # Behind an option argparse knows no more of them.
+        # argparse does not assign the overrides that follow an option.
         options.overrides += rest
-    # Imports wait until the arguments are known to be right: torch takes seconds to load.
+    # Import only once the arguments are known to be valid: torch takes seconds to load.
     from torchrl_l1.experiment.shutdown import orderly_end
 
     with orderly_end():
@@ -115,9 +116,9 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _print_anything() -> None:
-    """Let no character of a table or a path end a command because the terminal's encoding has none.
+    """Keep characters that the terminal's encoding lacks from ending a command.
 
-    It is escaped, as Python does on standard error.
+    They are escaped, as Python does on standard error.
     """
     if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -164,9 +165,9 @@ def _dispatch(options: argparse.Namespace, rest: list[str]) -> None:
 
 
 def _flush(command: str) -> None:
-    """Write what is left of the output, while it can still be told that this fails.
+    """Write the remaining output while a failure can still be reported.
 
-    Exits with status 1 if it does.
+    Exits with status 1 on failure.
     """
     try:
         sys.stdout.flush()
@@ -175,7 +176,7 @@ def _flush(command: str) -> None:
 
         where = "" if isinstance(error, BrokenPipeError) else "standard output: "
         print(f"torchrl-l1 {command}: {where}{message(error)}", file=sys.stderr)
-        # Nothing more can be written there, not even when the interpreter ends.
+        # Nothing more can be written there, not even when the interpreter exits.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
 
@@ -187,7 +188,7 @@ def _run_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         description="A Hydra application: overrides (seed=3 l1=off noise=action), sweeps (-m) "
         "and Hydra's own flags (--cfg job, --info) work as usual.",
     )
-    run.add_argument("recipe", help="such as metrpo/inverted_pendulum, or a YAML file of yours")
+    run.add_argument("recipe", help="such as metrpo/inverted_pendulum, or your own YAML file")
     run.add_argument("--resume", action="store_true", help="continue from the last checkpoint")
     run.add_argument("--trust", action="store_true", help=_TRUST)
 
@@ -197,40 +198,41 @@ def _campaign_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
         "campaign",
         help="run a matrix of runs and evaluate them",
         usage="torchrl-l1 campaign NAME [options] [KEY=VALUE ...]",
-        description="Every combination of recipes, settings and seeds of a campaign file, each in "
-        "a process of its own. Overrides (outer_iterations=2) count for all runs. What is finished "
-        "is skipped and what was interrupted goes on, so the same command may be given again and "
-        "again.",
+        description="Runs every combination of the recipes, settings and seeds in a campaign file, "
+        "each in its own process. Overrides (outer_iterations=2) apply to all runs. Finished runs "
+        "are skipped and interrupted ones continue, so the same command can be repeated.",
     )
     add = campaign.add_argument
-    add("campaign", metavar="NAME", help="such as table1, or a YAML file of yours")
-    add("--output", help="folder of all runs; runs/campaigns/NAME by default")
-    add("--workers", type=int, help="runs at a time; as many as there are cores by default")
-    add("--list", action="store_true", help="show the runs and how far they are, start nothing")
+    add("campaign", metavar="NAME", help="such as table1, or your own YAML file")
+    add("--output", help="folder for all runs; runs/campaigns/NAME by default")
+    add("--workers", type=int, help="number of parallel runs; the number of cores by default")
+    add("--list", action="store_true", help="show the runs and their progress, start nothing")
     add(
         "--reuse",
         nargs="+",
         action="extend",
         default=[],
         metavar="DIR",
-        help="copy finished runs with the same settings from these folders or below them",
+        help="copy finished runs with the same settings from these folders and their subfolders",
     )
     add("--trust", action="store_true", help=_TRUST)
-    add("--launcher", help="hand the runs to one of Hydra's launchers, such as joblib")
+    add("--launcher", help="start the runs with one of Hydra's launchers, such as joblib")
 
 
 def _report_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     report = commands.add_parser(
         "report",
-        help="tables and figures of all runs below a folder, beside the paper's",
+        help="tables and figures of all runs in a folder, beside the paper's",
         description="Writes report.md, CSV tables and PNG figures. Runs are found by their "
-        "config.yaml, in the folders and below them; nothing in them is changed.",
+        "config.yaml in the folders and their subfolders; the runs are not changed.",
     )
     add = report.add_argument
     add("dir", nargs="+", help="folders of runs, such as runs/campaigns/NAME")
-    add("--output", help="folder of the results; DIR/report by default")
+    add("--output", help="folder for the results; DIR/report by default")
     add(
-        "--reference-curves", metavar="FILE", help="authors' curves to draw behind, .csv or .csv.xz"
+        "--reference-curves",
+        metavar="FILE",
+        help="the authors' curves, drawn in the background: .csv or .csv.xz",
     )
 
 
@@ -245,7 +247,7 @@ def _recipes(copy: Sequence[str] | None) -> None:
         print("\n".join([*available_recipes(), "", "Campaigns:", *available_campaigns()]))
         return
     if len(copy) > 2:
-        raise ValueError(f"--copy takes a NAME and perhaps a FILE, got {' '.join(copy)}")
+        raise ValueError(f"--copy takes a NAME and an optional FILE, got {' '.join(copy)}")
     file = copy_recipe(*copy)
     command = "campaign" if copy[0] in available_campaigns() else "run"
     print(f"{file} is yours: torchrl-l1 {command} {shlex.quote(str(file))}")

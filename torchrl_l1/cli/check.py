@@ -1,4 +1,4 @@
-"""``torchrl-l1 check``: try a recipe's environment for a minute, and say what to fix."""
+"""``torchrl-l1 check``: try a recipe's environment for a minute and say what to fix."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from torchrl_l1.experiment.trial import STEPS, trial
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``torchrl-l1 check``."""
     add = parser.add_argument
-    add("recipe", help="a YAML file of yours, or a shipped recipe")
-    add("overrides", nargs="*", metavar="KEY=VALUE", help="as of torchrl-l1 run")
-    add("--steps", type=int, default=STEPS, help="random steps that are tried")
-    add("--trust", action="store_true", help="let the file set up Hydra itself")
+    add("recipe", help="your own YAML file or a shipped recipe")
+    add("overrides", nargs="*", metavar="KEY=VALUE", help="as for torchrl-l1 run")
+    add("--steps", type=int, default=STEPS, help="number of random steps to try")
+    add("--trust", action="store_true", help="let the file configure Hydra itself")
 
 
 def check_command(options: argparse.Namespace) -> None:
-    """``torchrl-l1 check``: a line for each finding; status 1 where something is to be fixed."""
+    """``torchrl-l1 check``: a line for each finding; status 1 if there is something to fix."""
     if options.steps < 10:
         raise ValueError(f"--steps must be at least 10, got {options.steps}")
     overrides = [*options.overrides, "run_dir=runs/check", "device=cpu"]

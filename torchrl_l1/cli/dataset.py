@@ -1,4 +1,4 @@
-"""``torchrl-l1 dataset``: data of a run's policy, for offline learning."""
+"""``torchrl-l1 dataset``: record data with a run's policy for offline learning."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--quality",
         choices=QUALITIES,
         default="expert",
-        help="random actions; the policy with so much noise that its return is a third to a half; "
-        "or the policy",
+        help="random actions; the policy with enough noise for a return a third to a half of the "
+        "way from random to expert; or the policy",
     )
-    add("--steps", type=int, default=20_000, help="how many at least, in whole episodes")
-    add("--seed", type=int, default=0, help="of resets, actions and noise")
+    add("--steps", type=int, default=20_000, help="minimum number of steps, in whole episodes")
+    add("--seed", type=int, default=0, help="seed of resets, actions and noise")
 
 
 def dataset_command(options: argparse.Namespace) -> None:
-    """``torchrl-l1 dataset``: the dataset, and a line on how good it is."""
+    """``torchrl-l1 dataset``: write the dataset and a line on its quality."""
     check_output(options.output)
     trained = load_run(options.run_dir)
     if not is_minari_name(options.output):
@@ -48,7 +48,7 @@ def dataset_command(options: argparse.Namespace) -> None:
         f"{len(found.episodes)} episodes, mean return {found.returns[1]:.4g}"
         + (f", {found.share:.2f} of the way from random to expert" * (found.share == found.share))
     )
-    # Hydra takes such names as they are, and others in quotes.
+    # Hydra accepts such names as they are; others need quotes.
     plain = re.fullmatch(r"[\w./+-]+", name)
     override = f"dataset={name}" if plain else typed_override("dataset", name)
     print(f"Dataset: {name}\nTo learn from it: torchrl-l1 run offline/... {override}")

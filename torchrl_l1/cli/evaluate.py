@@ -1,4 +1,4 @@
-"""``torchrl-l1 evaluate``: from its options to tables, plots and films."""
+"""``torchrl-l1 evaluate``: from options to tables, plots and films."""
 
 from __future__ import annotations
 
@@ -51,16 +51,16 @@ _SECONDS_SHOWN = 4.0
 _COLUMNS = 10
 
 
-# What an evaluation may leave beside its tables.
+# Files that an evaluation may write beside its tables.
 _PICTURES = ("robustness.png", "returns.png", "recovered.png", "filmstrip.png", "rollout.gif")
 
 
 class _Given(list[Any]):
-    """Values that were given, and are no default."""
+    """Values given by the user, as opposed to defaults."""
 
 
 class Gathered(argparse.Action):
-    """Values of an option, also where it stands several times: none takes another's place."""
+    """Values of an option that may be repeated: later values are added to earlier ones."""
 
     def __call__(
         self,
@@ -69,14 +69,14 @@ class Gathered(argparse.Action):
         values: Any,
         option_string: str | None = None,
     ) -> None:
-        """Add values to those that were given before."""
+        """Add values to those given before."""
         before = getattr(namespace, self.dest)
         given = before if isinstance(before, _Given) else []
         setattr(namespace, self.dest, _Given([*given, *values]))
 
 
 class _Suite(argparse.Action):
-    """The name of a suite, which brings controllers of its own where none are given."""
+    """The name of a suite, which brings its own controllers if none are given."""
 
     def __call__(
         self,
@@ -91,21 +91,20 @@ class _Suite(argparse.Action):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``torchrl-l1 evaluate``: one for all that it varies, and its own."""
+    """The options of ``torchrl-l1 evaluate``: one for each thing that it varies, and its own."""
     add = parser.add_argument
     add(
         "run_dir",
         nargs="+",
-        help="one or more run directories, or checkpoints that they keep, such as "
-        "RUN_DIR/checkpoints/best.pt",
+        help="one or more run directories or kept checkpoints, such as RUN_DIR/checkpoints/best.pt",
     )
-    group = parser.add_argument_group("disturbances", "They vary one at a time, or as in a suite.")
+    group = parser.add_argument_group("disturbances", "Varied one at a time, or by a suite.")
     group.add_argument(
         "--suite",
         choices=SUITES,
         action=_Suite,
-        help="all disturbances, each at a few values, in place of values of them; --l1 is then "
-        f"{' '.join(SUITE_L1)} by default",
+        help="all disturbances, each at a few values, instead of the options below; --l1 then "
+        f"defaults to {' '.join(SUITE_L1)}",
     )
     for axis in axes():
         where = group if axis.name in DISTURBANCES else parser
@@ -120,11 +119,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         )
     add("--episodes", type=int, default=25, help="episodes per cell and run")
     add("--seed", type=int, default=0, help="seed of resets, noise and sampled actions")
-    add("--output", help="folder of the results; RUN_DIR/evaluation by default")
+    add("--output", help="folder for the results; RUN_DIR/evaluation by default")
     add(
         "--filmstrip",
         action="store_true",
-        help="also render L1 off and on at the worst value of the disturbance that is varied",
+        help="also render L1 off and on at the worst value of the varied disturbance",
     )
 
 
@@ -137,18 +136,18 @@ def write_filmstrip(
 ) -> list[Path]:
     """Render one deterministic episode per condition into ``filmstrip.png`` and ``.gif``.
 
-    The conditions share the disturbance of that name; rows are named by their controllers, and by
-    their stages where there are several. Where no headless OpenGL works, a line says so and nothing
-    is written.
+    The conditions share the disturbance of that name; rows are named after their controllers, and
+    after their stages if there are several. Without working headless OpenGL, a line says so and
+    nothing is written.
 
     Returns:
-        what has been written.
+        the files written.
     """
     task = trained.algorithm.task
     if not isinstance(task, Task):
         print(
-            f"No filmstrip: poses are drawn of tasks of ours, not of {task.name}; torchrl-l1 play "
-            f"{trained.path} --output film.gif shows an episode"
+            f"No filmstrip: poses are drawn for built-in tasks only, not for {task.name}; use "
+            f"torchrl-l1 play {trained.path} --output film.gif to see an episode"
         )
         return []
     several = len({cell.stage for cell in cells}) > 1
@@ -169,7 +168,7 @@ def write_filmstrip(
 
 
 def _label(cell: Condition, several: bool) -> str:
-    """A line for each value that is set: a row is not wide."""
+    """One line for each value that is set, because rows are narrow."""
     controller = "L1 " + cell.controller.replace(" ", "\n")
     return f"{cell.stage}\n{controller}" if several else controller
 
@@ -187,7 +186,7 @@ def _poses(trained: TrainedRun, cell: Condition, steps: int, seed: int) -> np.nd
 
 
 def _check_one_study(runs: Sequence[TrainedRun]) -> None:
-    """Runs may differ in their seed and in nothing that matters."""
+    """Refuse runs that differ in more than their seed."""
 
     def settings(trained: TrainedRun) -> dict[str, Any]:
         told = vars(trained.recipe).items()
@@ -197,8 +196,8 @@ def _check_one_study(runs: Sequence[TrainedRun]) -> None:
         for other in runs[:number]:
             if other.path.resolve() == trained.path.resolve():
                 raise ValueError(
-                    f"{other.name} and {trained.name} are of one run, no two seeds; evaluate them "
-                    "one at a time"
+                    f"{other.name} and {trained.name} are of one run, not of two seeds; evaluate "
+                    "them one at a time"
                 )
     for trained in runs[1:]:
         if not same_code_in(vars(runs[0].recipe), vars(trained.recipe)):
@@ -214,21 +213,21 @@ def _check_one_study(runs: Sequence[TrainedRun]) -> None:
     seeds: dict[int, TrainedRun] = {}
     for trained in runs:
         other = seeds.setdefault(trained.recipe.seed, trained)
-        if other is not trained:  # a copy would count twice, and make intervals narrow
+        if other is not trained:  # a copy would count twice and make intervals too narrow
             raise ValueError(
-                f"{other.name} and {trained.name} are both of seed {trained.recipe.seed}, one "
-                "training and no two; leave one of them out"
+                f"{other.name} and {trained.name} are both of seed {trained.recipe.seed}, so they "
+                "are one training, not two; leave one of them out"
             )
 
 
 def _stages(runs: Sequence[TrainedRun], asked: Sequence[str]) -> list[str]:
-    """The stages to evaluate: those asked for, else the last that there is.
+    """The stages to evaluate: those requested, otherwise the last one reached.
 
-    The best of kept checkpoints may be of any iteration.
+    A best checkpoint may be of any iteration.
 
     Raises:
-        ValueError: for one that a run has not, or if none is asked for and runs are differently
-            far.
+        ValueError: for a stage that a run does not have, or if none is requested and the runs have
+            not progressed equally far.
     """
     names = asked or (None,)
     found = [list(dict.fromkeys(map(trained.stage, names))) for trained in runs]
@@ -236,21 +235,21 @@ def _stages(runs: Sequence[TrainedRun], asked: Sequence[str]) -> list[str]:
         if stages != found[0]:
             raise ValueError(
                 f"{runs[0].path} has reached the stage {found[0][0]} and {trained.path} "
-                f"{stages[0]}; say with --stage which one to evaluate"
+                f"{stages[0]}; choose with --stage which one to evaluate"
             )
     if not asked and any(trained.checkpoint != "best" for trained in runs):
         for trained in runs:
             if trained.algorithm.iteration != runs[0].algorithm.iteration:
                 raise ValueError(
                     f"{runs[0].name} is of {runs[0].algorithm.iteration} iterations and "
-                    f"{trained.name} of {trained.algorithm.iteration}; let both get equally far, "
+                    f"{trained.name} of {trained.algorithm.iteration}; train both equally far, "
                     "or evaluate them one at a time"
                 )
     return found[0]
 
 
 def _worst(values: Mapping[str, Sequence[float]]) -> tuple[str, float]:
-    """The first disturbance that is varied (or the first there is) where it is strongest."""
+    """The first varied disturbance (or else simply the first) at its strongest value."""
     worst = [
         (name, max(values[name], key=lambda value: abs(value - entry.neutral)))
         for name, entry in DISTURBANCES.items()
@@ -260,7 +259,7 @@ def _worst(values: Mapping[str, Sequence[float]]) -> tuple[str, float]:
 
 
 def _plots(summary: Sequence[Mapping[str, Any]], run: TrainedRun, output: Path) -> list[Path]:
-    """Draw returns against magnitudes and, where they say more, heat maps."""
+    """Draw returns against magnitudes and, where more informative, heat maps."""
     heading, facts = run.recipe.recipe, run.algorithm.facts
     robust = is_about_robustness(summary)
     lines = output / "robustness.png"
@@ -271,7 +270,7 @@ def _plots(summary: Sequence[Mapping[str, Any]], run: TrainedRun, output: Path) 
 
 
 def evaluate_command(options: argparse.Namespace) -> None:
-    """``torchrl-l1 evaluate``: table on the screen, CSV, PNG and, if asked, a filmstrip."""
+    """``torchrl-l1 evaluate``: print a table and write CSV, PNG and, on request, a filmstrip."""
     values = {axis.name: getattr(options, axis.name) for axis in axes()}
     check_values(values, prefix="--")
     check_suite(options.suite, values, prefix="--")
@@ -279,18 +278,18 @@ def evaluate_command(options: argparse.Namespace) -> None:
     for name in values["noise"]:
         group_setting("noise", name)
     if options.filmstrip and options.suite:
-        raise ValueError("--filmstrip shows one disturbance; give it in place of --suite")
+        raise ValueError("--filmstrip shows one disturbance; name it instead of giving --suite")
     if options.episodes < 1:
         raise ValueError(f"--episodes must be positive, got {options.episodes}")
     runs = [load_run(path) for path in dict.fromkeys(map(Path, options.run_dir))]
     _check_one_study(runs)
     values["stage"] = _stages(runs, options.stage)
     cells = distinct(runs[0], conditions(options.suite, **values))
-    if options.suite:  # of which none can be left out by hand
+    if options.suite:  # whose disturbances cannot be left out by hand
         cells = reachable(runs[0], cells)
     check_plants(runs[0].algorithm.task, cells)
     check_controllers(runs[0].recipe.l1, runs[0].algorithm.task, cells)
-    # A kept checkpoint has a folder of its own: its results are not the run's.
+    # A kept checkpoint has its own folder: its results are not the run's.
     folder = "_".join(filter(None, ["evaluation", runs[0].checkpoint]))
     output = Path(options.output) if options.output else runs[0].path / folder
     if not options.output:
@@ -306,9 +305,9 @@ def evaluate_command(options: argparse.Namespace) -> None:
                 progress.update()
 
     summary = summarize(rows, episodes)
-    for name in _PICTURES:  # those of an evaluation before are not of these tables
+    for name in _PICTURES:  # those of an earlier evaluation do not match these tables
         (output / name).unlink(missing_ok=True)
-    # Before anything is printed: what reads the output may have ended long ago.
+    # Before anything is printed: the reader of the output may have exited long ago.
     tables = {"evaluation": rows, "episodes": episodes, "summary": summary}
     for name, table in tables.items():
         write_table(output / f"{name}.csv", table)
@@ -321,7 +320,7 @@ def evaluate_command(options: argparse.Namespace) -> None:
         shown: dict[str, Any] = {name: [entry.neutral] for name, entry in DISTURBANCES.items()}
         name, worst = _worst(values)
         shown |= {name: [worst], "noise": ["none"], "policy": ["deterministic"]}
-        # Without the cell of no disturbance, whose rows would have the same names.
+        # Without the undisturbed cell, whose rows would have the same names.
         cells = [
             cell for cell in conditions(**{**values, **shown}) if cell.disturbances[name] == worst
         ]

@@ -13,17 +13,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``torchrl-l1 export``."""
     add = parser.add_argument
     add("target", help="a controller's folder or a run directory")
-    add("file", help=f"where to; the suffix says what: {', '.join(FORMATS)}")
-    add("--format", choices=sorted(set(FORMATS.values())), help="if the suffix does not say")
-    add("--l1", choices=PRESETS, help="what acts; the target's own by default, else robust")
+    add("file", help=f"file to write; the suffix sets the format: {', '.join(FORMATS)}")
+    add("--format", choices=sorted(set(FORMATS.values())), help="if the suffix does not tell")
+    add("--l1", choices=PRESETS, help="L1 preset; the target's own by default, else robust")
     add("--without-policy", action="store_true", help="L1 alone: the action is a second input")
-    add("--steps", type=int, default=100, help="steps on which it is compared with the original")
-    add("--seed", type=int, default=0, help="of those steps")
+    add("--steps", type=int, default=100, help="number of steps compared with the original")
+    add("--seed", type=int, default=0, help="seed of those steps")
     add("--trust", action="store_true", help="run the functions and pickles that a folder names")
 
 
 def export_command(options: argparse.Namespace) -> None:
-    """``torchrl-l1 export``: the file, its inputs and outputs, and how exact it is."""
+    """``torchrl-l1 export``: write the file; print its inputs, outputs and accuracy."""
     found = export(
         load_target(options.target, trusted=options.trust),
         options.file,

@@ -1,4 +1,4 @@
-"""``torchrl-l1 new-task``: write a recipe for an environment, with what was found in comments."""
+"""``torchrl-l1 new-task``: write a recipe for an environment, with the findings as comments."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchrl_l1.experiment.trial import describe
 
 ALGORITHMS = ("pets", "dets", "metrpo", "mbmf")
 
-# What a recipe would say, and what is said here.
+# Settings of a recipe, and the options that stand for them here.
 _OPTIONS = {
     "dt=": "--dt SECONDS",
     "horizon=": "--horizon STEPS",
@@ -36,25 +36,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="gymnasium/ID, PACKAGE:ID, dm_control/DOMAIN/TASK, MODULE:FUNCTION or "
         "FILE.py:FUNCTION",
     )
-    add("--algorithm", choices=ALGORITHMS, default=ALGORITHMS[0], help="what shall learn")
-    add("--dt", type=float, help="seconds of a step, where the environment does not tell")
-    add("--horizon", type=int, help="steps of an episode, where the environment does not tell")
+    add("--algorithm", choices=ALGORITHMS, default=ALGORITHMS[0], help="learning algorithm")
+    add("--dt", type=float, help="seconds per step, if the environment does not tell")
+    add("--horizon", type=int, help="steps per episode, if the environment does not tell")
     add(
         "--observation-keys",
         nargs="+",
         action=Gathered,
         default=[],
-        help="parts that make the observation",
+        help="parts that make up the observation",
     )
 
 
 def new_task_command(options: argparse.Namespace) -> None:
-    """``torchrl-l1 new-task``: the file, and what was found."""
+    """``torchrl-l1 new-task``: write the file and print what was found."""
     file = Path(options.file)
     if file.suffix != ".yaml":
         raise ValueError(f"{file} must end in .yaml")
     if file.exists():
-        raise ValueError(f"{file} exists already; choose another name")
+        raise ValueError(f"{file} already exists; choose another name")
     if options.dt is not None:
         check_positive("--dt", options.dt)
     if options.horizon is not None:
@@ -88,23 +88,23 @@ def recipe_text(options: argparse.Namespace, task: AnyTask) -> str:
     lines = [
         f"# {options.algorithm.upper()} on {options.source}:",
         *(f"#   {line}" for line in describe(task)),
-        f"# torchrl-l1 check {file} tries it, torchrl-l1 run {file} trains.",
+        f"# Try it with torchrl-l1 check {file}; train with torchrl-l1 run {file}.",
         "defaults:",
         f"  - /{options.algorithm}/any@_global_",
         "  - _self_",
         "",
         f"recipe: {yaml_word(Path(options.file).stem)}",
         f"task: {yaml_word(options.source)}",
-        f"dt: {options.dt!r}  # seconds of a step" if options.dt else "# dt: the environment tells",
-        f"horizon: {options.horizon}  # steps of an episode"
+        f"dt: {options.dt!r}  # seconds per step" if options.dt else "# dt: the environment tells",
+        f"horizon: {options.horizon}  # steps per episode"
         if options.horizon
-        else f"# horizon: {task.horizon}  # fewer steps make shorter episodes",
+        else f"# horizon: {task.horizon}  # fewer steps give shorter episodes",
         f"observation_keys: [{keys}]"
         if keys
-        else "# observation_keys: [..]  # where the observation comes in parts",
+        else "# observation_keys: [..]  # if the observation comes in parts",
         "",
-        "# What imagined steps earn, and where they end: builtin, learned, or MODULE:FUNCTION and",
-        "# FILE.py:FUNCTION in torch; a termination may be none.",
+        "# Reward of imagined steps, and where they end: builtin, learned, or MODULE:FUNCTION or",
+        "# FILE.py:FUNCTION written in torch; termination may be none.",
         f"reward: {word}" + (f"  # {note}" if note else ""),
         f"termination: {word}",
         "",

@@ -17,23 +17,27 @@ from torchrl_l1.experiment.l1_options import OFF
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``torchrl-l1 play``."""
     add = parser.add_argument
-    add("target", help="a controller's folder, a run directory, or an environment, with --policy")
-    add("--policy", help="the policy in an environment, see robustify; it has no L1 then")
+    add("target", help="a controller's folder, a run directory, or an environment with --policy")
+    add("--policy", help="policy for an environment, see robustify; it then has no L1")
     add("--normalization", metavar="FILE", help="statistics of VecNormalize, see robustify")
     add("--trust", action="store_true", help="run the functions and pickles that a folder names")
     add("--weights", metavar="FILE", help="a state dict to load into the policy's module")
-    add("--l1", choices=(OFF, *PRESETS), help="what acts; the target's own by default, else robust")
-    add("--compare", action="store_true", help="L1 off and on side by side")
-    add("--steps", type=int, default=500, help="after which the episode is cut off")
-    add("--seed", type=int, default=0, help="of reset and disturbances")
-    add("--output", metavar="FILE", help="a film, .mp4 or .gif, in place of a window")
+    add(
+        "--l1",
+        choices=(OFF, *PRESETS),
+        help="off or an L1 preset; the target's own by default, else robust",
+    )
+    add("--compare", action="store_true", help="show L1 off and on side by side")
+    add("--steps", type=int, default=500, help="number of steps after which the episode is cut off")
+    add("--seed", type=int, default=0, help="seed of reset and disturbances")
+    add("--output", metavar="FILE", help="write a film, .mp4 or .gif, instead of opening a window")
     group = parser.add_argument_group("disturbances")
     for name, entry in DISTURBANCES.items():
-        group.add_argument(f"--{name}", type=float, help=f"of the {entry.help}, one")
+        group.add_argument(f"--{name}", type=float, help=f"one of the {entry.help}")
 
 
 def play_command(options: argparse.Namespace) -> None:
-    """``torchrl-l1 play``: a window, or a film and a line that says where it is."""
+    """``torchrl-l1 play``: open a window, or write a film and print its path."""
     output = Path(options.output) if options.output else None
     check_film(output)
     if options.steps < 1:

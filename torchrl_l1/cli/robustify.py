@@ -43,8 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add(
         "env",
-        help="gymnasium/ID, PACKAGE:ID, a task of ours, dm_control/DOMAIN/TASK, or MODULE:FUNCTION "
-        "and FILE.py:FUNCTION, which return a TorchRL environment",
+        help="gymnasium/ID, PACKAGE:ID, a built-in task, dm_control/DOMAIN/TASK, or "
+        "MODULE:FUNCTION or FILE.py:FUNCTION that returns a TorchRL environment",
     )
     add(
         "--policy",
@@ -54,17 +54,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--normalization",
         metavar="FILE",
-        help="statistics of VecNormalize for sb3:FILE.zip, a pickle, which executes what is in it "
-        "as it is loaded; or none",
+        help="statistics of VecNormalize for sb3:FILE.zip, or none; the file is a pickle, and "
+        "loading it executes its contents",
     )
     add("--weights", metavar="FILE", help="a state dict to load into the policy's module")
-    add("--steps", type=int, default=20_000, help="steps of the environment that are collected")
-    add("--preset", choices=PRESETS, default=PRESETS[0], help="the L1 that acts by default")
-    add("--dt", type=float, help="seconds of a step; the environment's own by default")
-    add("--epsilon", type=float, help="tolerance of the paper's switching law, state units")
-    add("--noise", type=float, default=0.3, help="exploration, fraction of half the action's range")
+    add("--steps", type=int, default=20_000, help="number of environment steps to collect")
+    add("--preset", choices=PRESETS, default=PRESETS[0], help="L1 preset used by default")
+    add("--dt", type=float, help="seconds per step; the environment's own by default")
+    add("--epsilon", type=float, help="tolerance of the paper's switching law, in state units")
+    add(
+        "--noise",
+        type=float,
+        default=0.3,
+        help="exploration noise, as a fraction of half the action range",
+    )
     group = parser.add_argument_group(
-        "disturbances", "They vary one at a time, or as in a suite; without any, a few biases."
+        "disturbances", "Varied one at a time, or by a suite; a few biases if none are given."
     )
     group.add_argument("--suite", choices=SUITES, help="all disturbances, each at a few values")
     for name, entry in DISTURBANCES.items():
@@ -72,14 +77,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             f"--{name}", nargs="+", action=Gathered, type=float, default=[], help=entry.help
         )
     add("--episodes", type=int, default=10, help="episodes per cell")
-    add("--most-steps", type=int, default=1000, help="after which an episode is cut off")
-    add("--seed", type=int, default=0, help="of data, weights and resets")
-    add("--output", help="folder of the results; runs/robustify/ENV by default")
+    add(
+        "--most-steps",
+        type=int,
+        default=1000,
+        help="number of steps after which an episode is cut off",
+    )
+    add("--seed", type=int, default=0, help="seed of data, weights and resets")
+    add("--output", help="folder for the results; runs/robustify/ENV by default")
     add("--wandb", choices=MODES, default="disabled", help="mode of Weights & Biases")
 
 
 def robustify_command(options: argparse.Namespace) -> None:
-    """``torchrl-l1 robustify``: table on the screen; CSV, PNG, Markdown and the controller."""
+    """``torchrl-l1 robustify``: print a table; write CSV, PNG, Markdown and the controller."""
     disturbances: Any = {
         name: values for name in DISTURBANCES if (values := getattr(options, name))
     }
@@ -114,11 +124,11 @@ def robustify_command(options: argparse.Namespace) -> None:
             seed=options.seed,
         )
     except BaseException:
-        with suppress(OSError):  # another one may have begun to write there
+        with suppress(OSError):  # another process may have begun to write there
             for folder in fresh:
                 folder.rmdir()
         raise
-    # At once: a test that is broken off need not cost the controller.
+    # At once, so that an interrupted test does not cost the controller.
     folder = robust.save(controller)
     table = robust.evaluate(
         disturbances or _some_biases(robust),
@@ -126,7 +136,7 @@ def robustify_command(options: argparse.Namespace) -> None:
         most_steps=options.most_steps,
         seed=options.seed,
     )
-    # Before anything is printed: what reads the output may have ended long ago.
+    # Before anything is printed: the reader of the output may have exited long ago.
     write_table(output / "evaluation.csv", table.rows)
     write_table(output / "episodes.csv", table.episodes)
     print(f"\n{table.words}\n\n{table}\n")
@@ -140,18 +150,18 @@ def robustify_command(options: argparse.Namespace) -> None:
         try:
             _log(options, table, chart, output)
         except wandb.errors.Error as error:
-            print(f"W&B: {message(error)}; nothing else is lost", file=sys.stderr)
+            print(f"W&B: {message(error)}; all other results are written", file=sys.stderr)
 
 
 def _check_results(output: Path) -> None:
-    """Refuse a folder with files of the results' names that are none of a controller's."""
+    """Refuse a folder that has files named like the results but no controller."""
     for name in _RESULTS:
         if (output / name).exists() and not (output / "controller" / FILE).exists():
-            raise ValueError(f"{output / name} is there already: give another --output")
+            raise ValueError(f"{output / name} already exists: give another --output")
 
 
 def _check_disturbances(env: str, disturbances: Mapping[str, Sequence[float]]) -> None:
-    """Refuse what cannot be tested before data are collected and a model is fitted."""
+    """Refuse what cannot be tested, before data are collected and a model is fitted."""
     for name, values in disturbances.items():
         for value in values:
             check_disturbance(name, value, prefix="--")
@@ -165,7 +175,7 @@ def _folder(env: str) -> str:
 
 
 def _some_biases(robust: RobustController) -> dict[str, list[float]]:
-    """A sixth, a third and a half of half the range of the action."""
+    """A sixth, a third and a half of half the action range."""
     half = robust.config.half_range
     half = max(half) if isinstance(half, tuple) else half
     return {"bias": [round(half * share, 3) for share in (1 / 6, 1 / 3, 1 / 2)]}
@@ -192,13 +202,13 @@ def page(
         f"Policy `{options.policy}`, {options.steps} steps of data, seed {options.seed}.\n\n"
         f"{table.words}\n\n{table}\n\n![Returns](evaluation.png)\n\n"
         f"## Model\n\n```text\n{robust.model.quality}\n```\n\n"
-        f"## Settings of L1\n\n{settings}\n\nBy default acts `{robust.preset}`.\n\n"
+        f"## Settings of L1\n\n{settings}\n\nThe default is `{robust.preset}`.\n\n"
         f"## Use\n\n```python\n{usage}```\n"
     )
 
 
 def _log(options: argparse.Namespace, table: Assessment, chart: Path, output: Path) -> None:
-    """To the W&B run of the training that the policy is from, if there is one, else to its own."""
+    """Log to the W&B run of the training that made the policy, or else to a new run."""
     policy = Path(options.policy)
     if known_id(kept_by(policy) or policy):
         trained = load_run(policy)

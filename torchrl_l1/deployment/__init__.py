@@ -1,4 +1,4 @@
-"""L1 around policies of any origin: from a policy to a robust one, films and exports."""
+"""L1 around policies of any origin: robust controllers, films and exports."""
 
 from torchrl_l1.control import time_step
 from torchrl_l1.deployment.assessment import Assessment

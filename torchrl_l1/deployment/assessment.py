@@ -29,7 +29,7 @@ from torchrl_l1.report.recovery import controllers, recovered_text, recovery_col
 from torchrl_l1.report.style import arm_label, fit_scale, grid, legend_below, looks, save
 
 Disturbances: TypeAlias = str | Mapping[str, float | Sequence[float]]
-"""Name of a suite, or values of disturbances by name."""
+"""Name of a suite, or disturbance values by name."""
 
 Row = dict[str, Any]
 
@@ -43,7 +43,7 @@ def single_disturbances(disturbances: Disturbances) -> list[dict[str, float]]:
         disturbances: a suite of :func:`~torchrl_l1.envs.suite`, or values by name.
 
     Raises:
-        ValueError: for a disturbance or suite that there is not, or a value that it cannot have.
+        ValueError: for an unknown disturbance or suite, or a value out of a disturbance's range.
 
     Examples:
         >>> single_disturbances({"bias": [0.0, 0.5], "gain": 0.6})
@@ -64,7 +64,7 @@ def single_disturbances(disturbances: Disturbances) -> list[dict[str, float]]:
         entry = DISTURBANCES[name]
         for value in np.ravel(np.asarray(values, dtype=float)).tolist():
             entry.check(value)
-            # Twice the same cell would count its episodes twice.
+            # A repeated cell would count its episodes twice.
             if value != entry.neutral and {name: value} not in cells:
                 cells.append({name: value})
     return cells
@@ -72,7 +72,7 @@ def single_disturbances(disturbances: Disturbances) -> list[dict[str, float]]:
 
 @dataclass(frozen=True)
 class Episodes:
-    """First episodes of so many environments.
+    """The first episode of each environment.
 
     Attributes:
         returns: undiscounted ``(N,)``.
@@ -94,10 +94,10 @@ def run_episodes(
     most_steps: int,
     seed: int,
 ) -> TensorDictBase:
-    """Deterministic episodes ``[N, T]``; rows of those that end early repeat their last step.
+    """Deterministic episodes ``[N, T]``; rows that end early repeat their last step.
 
-    With one seed, episodes of one number start from the same reset whatever the disturbance and
-    the control. Where there is neither, a warning tells of actions beyond the bounds.
+    With the same seed, episodes of the same number start from the same reset whatever the
+    disturbance and the control. Without either, a warning reports actions beyond the bounds.
     """
     extra = [*policy_transforms(policy, source.one), *control]
     env = source.several(episodes, disturbances, extra)
@@ -128,15 +128,15 @@ def summarize_episodes(data: TensorDictBase) -> Episodes:
 
 @dataclass(frozen=True)
 class Assessment(Sequence[Row]):
-    """Rows of a test, one for each disturbance and controller; ``str`` is a table of them.
+    """Rows of a test, one for each disturbance and controller; ``str`` gives a table of them.
 
     Attributes:
         heading: what was tested.
-        rows: with the columns of disturbances that are tested, ``l1``, ``episodes``,
-            ``return_median``, ``_lowest``, ``_highest`` and ``_mean``, ``steps_median``,
-            ``switches_per_1000_steps``, and where there is an oracle those of
+        rows: with a column for each tested disturbance, ``l1``, ``episodes``, ``return_median``,
+            ``_lowest``, ``_highest`` and ``_mean``, ``steps_median``,
+            ``switches_per_1000_steps`` and, with an oracle, those of
             :func:`~torchrl_l1.report.recovery.recovery_columns`.
-        episodes: rows of the single episodes.
+        episodes: rows of single episodes.
     """
 
     heading: str
@@ -154,7 +154,7 @@ class Assessment(Sequence[Row]):
 
     @property
     def controllers(self) -> list[str]:
-        """The controllers in the order of the columns, the oracle last."""
+        """The controllers in column order, the oracle last."""
         return controllers(self.rows)
 
     def __str__(self) -> str:
@@ -179,7 +179,7 @@ class Assessment(Sequence[Row]):
 
     @property
     def words(self) -> str:
-        """What the cells of the table are."""
+        """What the cells of the table show."""
         count = self.rows[0]["episodes"]
         text = (
             f"Median return of {count} episode{'s' * (count != 1)} [lowest, highest]"
@@ -197,8 +197,8 @@ class Assessment(Sequence[Row]):
     def plot(self, file: str | Path) -> Path:
         """Draw returns, and lengths where they differ, against each disturbance.
 
-        A disturbance that is tested at several magnitudes has panels of its own, with medians as
-        lines and ranges as bands; of others the first chart has bars.
+        If every disturbance is tested at several magnitudes, each has its own panels, with medians
+        as lines and ranges as bands; otherwise there is one bar chart of all.
 
         Returns:
             the file.
@@ -230,7 +230,7 @@ class Assessment(Sequence[Row]):
         return save(figure, file)
 
     def _varied(self) -> dict[str, list[Row]]:
-        """By name, the rows in which no other disturbance acts; undisturbed ones in each."""
+        """For each name, the rows in which no other disturbance acts, undisturbed ones included."""
         names = dict.fromkeys(name for row in self.rows for name in disturbed(row))
         return {
             name: [
@@ -295,19 +295,20 @@ def assess(
     on_cell: Callable[[int], object] | None = None,
     heading: str = "",
 ) -> Assessment:
-    """Test a policy under disturbances without L1, with each setting of it and with the oracle.
+    """Test a policy under disturbances without L1, with each setting of L1 and with the oracle.
 
     Args:
         source: makes the environments.
         policy: the policy.
         model: the learned dynamics.
         configs: settings of L1 by the name of their column.
-        disturbances: what is tested. Of a suite, what cannot act on the environment is left out.
-        episodes: in each cell.
-        most_steps: after which an episode is cut off.
-        seed: of the resets and of what disturbances draw.
-        on_cell: called with the number of all cells after each, for progress bars.
-        heading: of the chart.
+        disturbances: what to test. Disturbances of a suite that cannot act on the environment are
+            left out.
+        episodes: number of episodes per cell.
+        most_steps: number of steps after which an episode is cut off.
+        seed: seed of resets and random disturbances.
+        on_cell: called with the total number of cells after each cell, for progress bars.
+        heading: heading of the chart.
     """
     cells = single_disturbances(disturbances)
     longest = min(most_steps, episode_steps(source))
@@ -323,7 +324,7 @@ def assess(
         if l1 != ORACLE or all(DISTURBANCES[name].matched for name in cell)
     ]
     if not any(cell and l1 == ORACLE for cell, l1 in todo):
-        todo = [one for one in todo if one[1] != ORACLE]  # nothing that it would be told
+        todo = [one for one in todo if one[1] != ORACLE]  # there is no disturbance to tell it
     rows, single = [], []
     for cell, l1 in todo:
         control: list[Transform] = []

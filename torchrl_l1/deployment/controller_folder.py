@@ -1,4 +1,4 @@
-"""The folder of a robust controller: what it holds, and what is named in it."""
+"""The folder of a robust controller: its files, and the environment and policy that it names."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from torchrl_l1.experiment.run_directory import RunDirectory, read_config
 from torchrl_l1.experiment.settings import NAMING_KEYS
 
 FILE, MODEL = "controller.json", "model.safetensors"
-"""Names of its files: settings, and the model."""
+"""Names of its files: the settings and the model."""
 
 FORMAT = 1
-"""Of the settings."""
+"""Format of the settings."""
 
 _MOST_BYTES = 1_000_000
 _WITH = " with "
@@ -30,8 +30,8 @@ _WITH = " with "
 def copied(
     file: Path, folder: Path, role: str, content: Callable[[Path], bytes] = Path.read_bytes
 ) -> str:
-    """Put a copy of a file into a folder, unless it is that of the folder; its name there."""
-    # With its role, since files of different folders may have one name.
+    """Copy a file into a folder, unless it is already there; returns its name there."""
+    # The role is part of the name, since files from different folders may share a name.
     target = folder / (file.name if file.name.startswith(role) else f"{role}_{file.name}")
     if file.resolve() != target.resolve():
         write_atomically(target, content(file))
@@ -39,11 +39,11 @@ def copied(
 
 
 def read_controller(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
-    """What a controller's file holds, and its settings of L1.
+    """The contents of a controller's file, and its settings of L1.
 
     Raises:
-        FileNotFoundError: if there is none.
-        ValueError: if it is damaged, or of another version.
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is damaged or of another version.
     """
     try:
         stored = json.loads(read_text(file, _MOST_BYTES))
@@ -54,7 +54,7 @@ def read_controller(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
             for digests in (stored.get("files") or {}, stored.get("code") or {}):
                 names += [*digests.keys(), *digests.values()]
             if not all(name is None or isinstance(name, str) for name in names):
-                raise TypeError("a name in it is no text")
+                raise TypeError("a name in it is not text")
             configs = {name: L1Config(**values) for name, values in stored["configs"].items()}
             _ = configs[stored["preset"]]
             return stored, configs
@@ -63,16 +63,16 @@ def read_controller(file: Path) -> tuple[dict[str, Any], dict[str, L1Config]]:
     ) as error:  # fmt: skip
         raise ValueError(f"{file} is damaged ({error!r}): robustify the policy again") from error
     raise ValueError(
-        f"{file} has the format {stored['format']!r}, and this version reads {FORMAT}: robustify "
+        f"{file} has the format {stored['format']!r}, but this version reads {FORMAT}: robustify "
         "the policy again"
     )
 
 
 def check_files(folder: Path, digests: Mapping[str, str]) -> None:
-    """Refuse files that are not those which the settings were written with.
+    """Refuse files that are not the ones written with the settings.
 
     Raises:
-        ValueError: naming the first.
+        ValueError: naming the first such file.
     """
     for name, known in digests.items():
         file = folder / name
@@ -83,7 +83,7 @@ def check_files(folder: Path, digests: Mapping[str, str]) -> None:
 
 
 def code_of(names: Iterable[object], search_path: Sequence[str]) -> dict[str, str]:
-    """Digests of the files and modules that environment and policy are named by."""
+    """Digests of the files and modules that define environment and policy."""
     texts = (name for name in names if isinstance(name, str))
     return code_digests([n for n in texts if n.partition(":")[0] not in FILE_KINDS], search_path)
 
@@ -102,7 +102,7 @@ def check_replaces(
     """
     try:
         stored, _ = read_controller(folder / FILE)
-    except (FileNotFoundError, ValueError):  # nothing that is of use
+    except (FileNotFoundError, ValueError):  # nothing worth keeping
         return
     held = (stored["environment"], stored.get("given"))
     if held[1] is not None and held != (environment, given_by(policy, normalization, weights)):
@@ -116,7 +116,7 @@ def check_spares(origin: Mapping[str, Any], file: Path) -> None:
     """Refuse to replace a file that a policy comes from, or one in its run directory.
 
     Raises:
-        ValueError: naming both.
+        ValueError: naming both files.
     """
     names = [origin.get(name) for name in ("policy", "normalization", "weights")]
     for name in filter(None, [*names, *str(origin.get("given") or "").split(_WITH)]):
@@ -125,18 +125,18 @@ def check_spares(origin: Mapping[str, Any], file: Path) -> None:
         place = kept_by(source) or source
         if file.exists() and file.resolve().is_relative_to(place.resolve()):
             raise ValueError(
-                f"{file} is there, and the policy comes from {source}: name another file"
+                f"{file} exists, and the policy comes from {source}: name another file"
             )
 
 
 def given_by(policy: str | None, *files: str | None) -> str | None:
-    """What names a policy, with the files that belong to it; ``None`` for an object."""
+    """The name of a policy, with the files that belong to it; ``None`` for an object."""
     named = [policy, *files] if policy else []
     return _WITH.join(_whole(name) for name in named if name) or None
 
 
 def _whole(name: str) -> str:
-    """A name with the whole path of the file or folder in it."""
+    """A name with the absolute path of the file or folder in it."""
     for part in (name, *name.split(":", 1)):
         if part and Path(part).exists():
             return name.replace(part, str(Path(part).resolve()))
@@ -144,7 +144,7 @@ def _whole(name: str) -> str:
 
 
 def check_runs_nothing(folder: Path, stored: dict[str, Any]) -> None:
-    """Refuse a controller whose environment or policy is code, or a pickle.
+    """Refuse a controller whose environment or policy is code or a pickle.
 
     Raises:
         ValueError: naming it.
@@ -156,7 +156,7 @@ def check_runs_nothing(folder: Path, stored: dict[str, Any]) -> None:
 
 
 def check_run_names_nothing(policy: Policy | None) -> None:
-    """Refuse a run whose settings name code; what is no run passes.
+    """Refuse a run whose settings name code; anything that is not a run passes.
 
     Raises:
         ValueError: naming it.
@@ -169,19 +169,19 @@ def _refuse_code(where: object, names: Iterable[object], data: Sequence[str] = (
     for name in map(str, names):
         if ":" in name and name.partition(":")[0] not in data:
             raise ValueError(
-                f"{where} names {name!r}, which would be run: say --trust, in Python trusted=True, "
-                "if the folder is yours"
+                f"{where} names {name!r}, which would be run: give --trust (trusted=True in "
+                "Python) if the folder is yours"
             )
 
 
 def settings_of_run(policy: Policy | None) -> dict[str, Any]:
-    """The settings of the run that a policy is from; none if it is from elsewhere."""
+    """The settings of the run that a policy comes from; empty if it comes from elsewhere."""
     run = Path(policy) if isinstance(policy, str) else None
     config = None if run is None else RunDirectory(kept_by(run) or run).config_file
     return {} if config is None or not config.is_file() else read_config(config)
 
 
 def placed(name: str | None, folder: Path) -> str | None:
-    """Where a file lies whose name a controller holds."""
+    """The path of a file that a controller names."""
     kind, colon, file = (name or "").rpartition(":")
     return f"{kind}{colon}{folder / file}" if name and (folder / file).is_file() else name

@@ -1,4 +1,4 @@
-"""Policy and L1 as one function with its state in the open, for machines without TorchRL."""
+"""Policy and L1 as one function with explicit state, for machines without TorchRL."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ from torchrl_l1.envs.references import require
 from torchrl_l1.experiment.files import make_place
 
 FORMATS = {".pt": "torchscript", ".ts": "torchscript", ".onnx": "onnx", ".pt2": "export"}
-"""What a file holds, by its suffix."""
+"""Format of a file by its suffix."""
 
-# Draws around the recorded steps, and the difference there, as a fraction of half the action's
-# range: rounding counts for more far from the data.
+# Draws around the recorded steps, and the difference allowed there as a fraction of half the action
+# range: far from the data, rounding errors are larger.
 _DRAWS, _AWAY = 200, 1e-2
 
-_DECIDES = "it decides by the values that it sees, and one way of such a decision would be written"
+_DECIDES = "it branches on values that it sees, and only one branch would be written"
 
-# Loggers that would show whole programs.
+# Loggers that would print whole programs.
 _LOGGERS = ("torch.onnx", "torch.export", "torch.fx")
 
 Step = Callable[..., Sequence[Tensor]]
@@ -69,17 +69,17 @@ class ControlledStep(nn.Module):
     ) -> None:
         super().__init__()
         self.config = config
-        # Neither is registered, and their weights become constants: tracers walk through the
-        # attributes of what is, and those of TorchRL's actors raise.
+        # Neither is registered, so their weights become constants: tracers walk through the
+        # attributes of registered modules, and those of TorchRL's actors raise.
         self.jacobian = ActionJacobian(copy.deepcopy(model).requires_grad_(False))
         self.policies: tuple[TensorDictModuleBase, ...] = ()
         if policy is not None:
             copied = copy.deepcopy(policy)
             for parameter in copied.parameters():
-                parameter.detach_()  # of a copied script parameters are no leaves
+                parameter.detach_()  # parameters of a copied script are not leaves
                 parameter.requires_grad_(False)
             self.policies = (copied,)
-            # A trace takes scripts as they are, from what is registered.
+            # A trace includes scripts as they are, but only registered ones.
             parts = [part for part in copied.modules() if isinstance(part, torch.jit.ScriptModule)]
             self.scripts = nn.ModuleList(parts)
         fresh = init([1], model.observation_dim, model.action_dim, config)
@@ -110,18 +110,20 @@ class ControlledStep(nn.Module):
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written.
+    """An exported function.
 
     Attributes:
-        file: where it is.
+        file: its file.
         inputs: names of the inputs; all have a batch dimension of one.
         outputs: names of the outputs.
-        error: largest difference of the executed input on recorded steps, action units.
-        steps: how many steps that were.
-        dt: time between two calls of the function, s; at another the controller is wrong.
-        preset: settings of L1 that act in it.
-        transforms: of the environment, from the plant on, through which observation and action go
-            outside the file; where parts are joined to an observation, with these in order.
+        error: largest difference of the executed input on recorded steps, in action units.
+        steps: number of these steps.
+        dt: time between two calls of the function in seconds; with any other, the controller is
+            wrong.
+        preset: its settings of L1.
+        transforms: transforms of the environment, starting at the plant, that must be applied to
+            observation and action outside the file; where one joins parts to an observation, the
+            parts are listed in order.
     """
 
     file: Path
@@ -148,43 +150,43 @@ def export(
     """Write a policy with L1 as one function, and compare it with the original.
 
     Inputs are ``observation (1, n)`` and the entries of :class:`~torchrl_l1.control.L1State` that
-    the settings need, outputs ``action (1, m)`` and the same entries for the next step, by the
-    same names with ``next_`` before them. An episode begins with zeros (``started`` false), as
-    :func:`~torchrl_l1.control.init` makes them. All is float32 but ``n_switch`` (int64) and
+    the settings need; outputs are ``action (1, m)`` and the same entries for the next step, with
+    ``next_`` prefixed to their names. An episode begins with zeros (``started`` false), as
+    :func:`~torchrl_l1.control.init` makes them. All are float32 except ``n_switch`` (int64) and
     ``started`` (bool).
 
-    Observation and action are those behind the environment's transforms, which are not written.
-    ``dt``, the time between two calls, and ``preset`` are in the file as text: ``_extra_files`` of
-    TorchScript, ``extra_files`` of ``torch.export``, metadata of ONNX.
+    Observation and action are those seen through the environment's transforms, which are not
+    exported. ``dt``, the time between two calls, and ``preset`` are stored in the file as text:
+    ``_extra_files`` of TorchScript, ``extra_files`` of ``torch.export``, metadata of ONNX.
 
     Args:
-        robust: what is written.
+        robust: the controller to export.
         file: ``.pt`` or ``.ts`` for TorchScript, ``.onnx``, or ``.pt2`` for a program of
             ``torch.export``.
-        format: ``"torchscript"``, ``"onnx"`` or ``"export"``, if the suffix does not say.
-        preset: settings of L1; those that act by default if ``None``.
-        with_policy: without it, the policy's action is a second input ``u_rl (1, m)``.
-        steps: of the environment, on which it is compared at most; an episode may end before.
-        tolerance: largest difference allowed, as a fraction of half the range of the action.
-        seed: of those steps.
+        format: ``"torchscript"``, ``"onnx"`` or ``"export"``, if the suffix does not tell.
+        preset: settings of L1; the default preset if ``None``.
+        with_policy: if false, the policy's action is a second input ``u_rl (1, m)``.
+        steps: maximum number of environment steps compared; the episode may end earlier.
+        tolerance: largest difference allowed, as a fraction of half the action range.
+        seed: seed of those steps.
 
     Returns:
-        names of inputs and outputs, the largest difference, and what is left to do outside.
+        names of inputs and outputs, the largest difference, and the transforms left outside.
 
     Raises:
         OSError: if the file cannot be written there.
-        ValueError: for another format, a file that the policy comes from, a policy that has a
-            memory or is not made of torch's operations, or a difference above the tolerance, or
-            above a hundredth at observations around the recorded ones, as of a policy that decides
-            by values in Python.
+        ValueError: for an unknown format; a file that the policy comes from; a policy that has a
+            memory or is not made of torch operations; a difference above the tolerance; or one
+            above a hundredth at observations around the recorded ones, as with a policy that
+            branches on values in Python.
 
     Warns:
-        UserWarning: if a trace was made of a policy that looks at values in Python, or the
-            environment has transforms of the observation or the action.
+        UserWarning: if a traced policy reads values in Python, or if the environment transforms
+            the observation or the action.
     """
     file = Path(file)
     if format is None and file.suffix not in FORMATS:
-        raise ValueError(f"{file} must end in {', '.join(FORMATS)}, or format say what to write")
+        raise ValueError(f"{file} must end in {', '.join(FORMATS)}; otherwise give a format")
     format = FORMATS[file.suffix] if format is None else format
     check_choice("format", format, ("torchscript", "onnx", "export"))
     check_count("steps", steps)
@@ -194,19 +196,19 @@ def export(
     check_spares(robust.origin, file)
     if with_policy and get_primers_from_module(robust.policy, warn=False) is not None:
         raise ValueError(
-            "the policy remembers something from step to step, as a planner its plan, and no file "
-            "holds that: export L1 alone (with_policy=False, --without-policy)"
+            "the policy remembers something from step to step, as a planner does its plan, which "
+            "no file can hold: export L1 alone (with_policy=False, --without-policy)"
         )
     make_place(file)
     config, recorded = _recorded(robust, preset, steps, seed)
-    steps = len(recorded)  # the episode may end before
+    steps = len(recorded)  # the episode may end earlier
     policy = robust.policy if with_policy else None
     preset = robust.preset if preset is None else preset
     facts = {"dt": str(config.dt), "preset": preset}
     first = recorded["observation"][:1]
     given = () if with_policy else (recorded["action"][:1],)
     module: ControlledStep | None = None
-    # In a folder of its own: what is there already stays if this one is no good.
+    # In a temporary folder: an existing file is kept if this export fails.
     with torch.no_grad(), _quiet() as told, TemporaryDirectory() as folder:
         written = Path(folder, f"function{file.suffix}")
         try:
@@ -216,7 +218,7 @@ def export(
             outputs = ("action", *(f"next_{name}" for name in names))
             example = (first, *given, *module.fresh.values())
             step = _WRITERS[format](module, example, written, facts, inputs, outputs)
-        except Exception as error:  # of the tracers, anything
+        except Exception as error:  # tracers may raise anything
             if not with_policy:
                 raise
             raise ValueError(_not_written(error, format, module)) from error
@@ -228,16 +230,16 @@ def export(
     _check_exact(file, config, worst, away, tolerance, steps)
     if lines := _looked_at(told):
         warnings.warn(
-            f"the policy looks at values in Python ({'; '.join(lines)}): if it decides by them, "
-            f"one way is in {file}, which differs nowhere in {steps} steps and {_DRAWS} draws "
-            "around them; torch.where has both",
+            f"the policy reads values in Python ({'; '.join(lines)}): if it branches on them, "
+            f"{file} holds only one branch; it agrees with the original in {steps} steps and "
+            f"{_DRAWS} draws around them; use torch.where to export both branches",
             stacklevel=2,
         )
     outside = tuple(_outside(robust.source.one()))
     if outside:
         warnings.warn(
-            f"{file} does not hold what the environment does between plant and policy: give it "
-            f"observations, and send on its actions, through {', '.join(outside)}",
+            f"{file} does not include the environment's transforms between plant and policy: apply "
+            f"{', '.join(outside)} to its observations and actions",
             stacklevel=2,
         )
     write_atomically(file, content)
@@ -245,11 +247,11 @@ def export(
 
 
 def _not_written(error: Exception, format: str, module: ControlledStep | None) -> str:
-    """Why a policy cannot be written, and what can."""
+    """Why a policy cannot be written, and what can be written instead."""
     why = next(iter(str(error).split("\n", 1)), "").strip() or type(error).__name__
     why = _DECIDES if isinstance(error, GuardOnDataDependentSymNode) else why
     other = ""
-    if module is not None and why != _DECIDES:  # else none can write it
+    if module is not None and why != _DECIDES:  # otherwise no format can hold it
         better = ".pt" if module.scripts else ".pt2"
         other = f"try {better}, or " * (format != FORMATS[better])
     return (
@@ -261,27 +263,27 @@ def _not_written(error: Exception, format: str, module: ControlledStep | None) -
 def _check_exact(
     file: Path, config: L1Config, worst: float, away: float, tolerance: float, steps: int
 ) -> None:
-    """Refuse a function that differs from the original, on the recorded steps or beside them."""
+    """Refuse a function that differs from the original on the recorded steps or around them."""
     half = config.half_range
     half_range = min(half) if isinstance(half, tuple) else half
     allowed = tolerance * half_range
     if not worst <= allowed:
         raise ValueError(
             f"{file} differs from the original by up to {worst:.3g} action units in {steps} steps, "
-            f"and {allowed:.3g} are allowed: a policy that draws random numbers, or that is not "
-            "made of torch's operations, cannot be exported (see with_policy, --without-policy)"
+            f"and {allowed:.3g} are allowed: a policy that draws random numbers or is not made of "
+            "torch operations cannot be exported (see with_policy, --without-policy)"
         )
     if not away <= _AWAY * half_range:
         raise ValueError(
-            f"{file} is equal to the original along the recorded steps, but differs by up to "
-            f"{away:.3g} action units where these did not lead: the policy decides by what it sees "
-            "in Python or NumPy, of which only one way is written (use torch.where, or see "
-            "with_policy, --without-policy)"
+            f"{file} equals the original along the recorded steps, but differs by up to "
+            f"{away:.3g} action units away from them: the policy branches on values in Python or "
+            "NumPy, and only one branch is written (use torch.where, or see with_policy, "
+            "--without-policy)"
         )
 
 
 def _outside(env: EnvBase) -> list[str]:
-    """The transforms that an observation has come through, or an action goes through, in words."""
+    """The transforms that the observation or the action passes through, as text."""
     transforms = [one for one in transforms_of(env) if isinstance(one, Transform)]
     observations, actions, found = {"observation"}, {"action"}, []
     for transform in reversed(transforms):
@@ -291,7 +293,7 @@ def _outside(env: EnvBase) -> list[str]:
         sends = actions.intersection(transform.out_keys_inv)
         observations |= set(transform.in_keys) if reads else set()
         actions |= set(transform.in_keys_inv) if sends else set()
-        # A change of type is none here: all is float32.
+        # A change of dtype does not count: everything is float32.
         if (reads or sends) and not isinstance(transform, DTypeCastTransform):
             parts = ", ".join(map(str, transform.in_keys))
             joins = isinstance(transform, CatTensors)
@@ -311,7 +313,7 @@ def _recorded(
 
 
 def vector_bounds(robust: RobustController) -> dict[str, Any]:
-    """Bounds of the action that the settings leave open, from the environment."""
+    """Action bounds that the settings leave open, taken from the environment."""
     space = getattr(robust.source.one().full_action_spec["action"], "space", None)
     found = {}
     for name, side in (("action_low", "low"), ("action_high", "high")):
@@ -332,7 +334,7 @@ def _compare(
         executed, *state = step(row["observation"][None], *given, *state)
         difference = executed[0] - row["next", "l1", "u_exec"]
         worst = max(worst, float(difference.abs().max()))
-        # A difference that is not a number must not look like none.
+        # A NaN difference must not pass for none.
         worst = worst if bool(difference.isfinite().all()) else float("inf")
     return worst
 
@@ -347,9 +349,9 @@ def _compare_away(
 ) -> float:
     """Largest difference of executed inputs at observations and actions around recorded ones.
 
-    What a tracer has taken for a constant shows where an episode of the policy does not lead: up to
-    a hundred times as far as the data of the model, ``reach (n,)``, or the episode if it went
-    further.
+    Values that a tracer has baked in as constants show only where the policy's episode does not
+    lead: up to a hundred times as far as the range of the model's data, ``reach (n,)``, or that of
+    the episode if larger.
     """
     generator = torch.Generator().manual_seed(seed)
     seen = recorded["observation"]
@@ -367,7 +369,7 @@ def _compare_away(
         _, *state = module(row["observation"][None], *given, *now)
         try:
             expected, *_ = module(observation, *given, *now)
-        except Exception:  # a policy may refuse what is out of its range
+        except Exception:  # a policy may refuse observations out of its range
             continue
         executed, *_ = step(observation, *given, *now)
         same = (executed == expected) | (executed.isnan() & expected.isnan())
@@ -377,7 +379,7 @@ def _compare_away(
 
 
 def _looked_at(told: Sequence[warnings.WarningMessage]) -> list[str]:
-    """Lines in which Python was told values while a trace was made, but for those of libraries."""
+    """Lines outside of libraries in which Python read tensor values during tracing."""
     ours = Path(__file__).parents[1]
     libraries = [ours, *(Path(str(m.__file__)).parent for m in (torch, torchrl, tensordict))]
     own = [
@@ -434,7 +436,7 @@ def _onnx(
     program.save(str(file), external_data=False)
     runtime = require("onnxruntime", "onnx")
     session = runtime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
-    # What does not matter to any output is no input of the graph.
+    # Values that no output depends on are not inputs of the graph.
     known = {one.name for one in session.get_inputs()}
 
     def step(*values: Tensor) -> list[Tensor]:
@@ -454,7 +456,7 @@ _WRITERS: dict[str, Callable[..., Step]] = {
 
 @contextmanager
 def _quiet() -> Iterator[list[warnings.WarningMessage]]:
-    """Without what the exporters say of themselves, but for a list of their warnings."""
+    """Silence the exporters; yields the list of their warnings."""
     loggers = {logging.getLogger(name): logging.getLogger(name).level for name in _LOGGERS}
     for logger in loggers:
         logger.setLevel(logging.ERROR)

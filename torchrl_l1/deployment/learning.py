@@ -1,4 +1,4 @@
-"""From a policy to a model: what is collected, what is fitted, and how switching is tuned."""
+"""From a policy to a model: collecting data, fitting, and tuning the switching law."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ from torchrl_l1.dynamics.transitions import check_time_step
 from torchrl_l1.envs import EnvironmentSource
 
 FEW_OBSERVATIONS = 5
-"""Below this width of the observation, the paper's rule of thumb allows few switches."""
+"""For observations narrower than this, the paper's rule of thumb allows few switches."""
 
 _MEAN_HOLD = 10
 
-_ROWS = 10  # recorded steps are laid side by side in so many
+_ROWS = 10  # number of rows into which recorded steps are arranged
 _ROUNDING = 1e-5  # of a bound
 
 
 class Acting(TensorDictModuleBase):
-    """A policy whose actions are looked at on the way: their shape, and how many leave the bounds.
+    """A policy whose actions are checked: their shape, and how many exceed the bounds.
 
     Args:
         policy: the policy.
         action: spec of the action, for all environments.
 
     Attributes:
-        steps: steps of single environments so far.
-        beyond: those with an action beyond the bounds.
+        steps: steps so far, summed over the environments.
+        beyond: number of them with an action beyond the bounds.
 
     Raises:
         ValueError: if the policy fails at its first call, or returns another shape.
@@ -71,7 +71,7 @@ class Acting(TensorDictModuleBase):
         except Exception as error:
             if self.steps:
                 raise
-            # Of a policy that is made for something else, anything.
+            # A policy made for something else may raise anything.
             raise ValueError(
                 f"the policy failed at its first call, with observations of shape "
                 f"{list(tensordict['observation'].shape)} and {tensordict['observation'].dtype}: "
@@ -90,12 +90,12 @@ class Acting(TensorDictModuleBase):
         return tensordict
 
     def warn_of_bounds(self) -> None:
-        """Say so where actions lay beyond the bounds."""
+        """Warn if actions lay beyond the bounds."""
         if self.beyond:
             warnings.warn(
                 f"{self.beyond} of {self.steps} actions of the policy lie beyond the environment's "
-                "bounds: L1 and the oracle clip them, and without L1 disturbances act on them as "
-                "they are, so that their rows differ by that too; clip the action in the policy",
+                "bounds: L1 and the oracle clip them, while without L1 disturbances act on the "
+                "unclipped actions, so that the rows differ by this too; clip them in the policy",
                 stacklevel=2,
             )
 
@@ -103,17 +103,16 @@ class Acting(TensorDictModuleBase):
 class Exploration(TensorDictModuleBase):
     r"""A policy with noise on its action, for data that a model can be fitted to.
 
-    Half of the noise is held for a number of steps that is drawn anew each time, ten in the mean:
-    the model must know what an action does that is off for a while, as under a disturbance. The
-    other half is new in every step. The level of both is drawn with the held part, between none and
-    twice ``noise``, so that some data are those of the policy itself. Actions stay within their
-    bounds.
+    Half of the noise is held for a random number of steps, ten on average: the model must learn
+    the effect of an action that is off for a while, as under a disturbance. The other half is new
+    in every step. The level of both is drawn together with the held part, between zero and twice
+    ``noise``, so that some data are close to the policy itself. Actions stay within their bounds.
 
     Args:
         policy: the policy.
         action: spec of the action, for all environments.
-        noise: standard deviation as a fraction of half the range of the action, or in action units
-            where it has no bounds.
+        noise: standard deviation as a fraction of half the action range, or in action units if the
+            action is unbounded.
     """
 
     def __init__(self, policy: TensorDictModuleBase, action: TensorSpec, noise: float) -> None:
@@ -133,7 +132,7 @@ class Exploration(TensorDictModuleBase):
         self.level = 2 * torch.rand_like(zero[..., :1])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the policy's action with noise."""
+        """Write the policy's action with noise added."""
         tensordict = self.policy(tensordict)
         renewed = torch.rand_like(self.level) < 1 / _MEAN_HOLD
         self.held = torch.where(renewed, torch.randn_like(self.held), self.held)
@@ -148,11 +147,11 @@ class Exploration(TensorDictModuleBase):
 def policy_transforms(
     policy: TensorDictModuleBase, make_env: Callable[[], EnvBase]
 ) -> list[Transform]:
-    """What an environment needs for a policy with a memory, wherever in the policy that is.
+    """Transforms that an environment needs for a policy with a memory, at any depth in the policy.
 
     Args:
         policy: the policy.
-        make_env: makes such an environment, to which nothing is added that it has already.
+        make_env: makes such an environment; what it already has is not added again.
     """
     primers = get_primers_from_module(policy, warn=False)
     tracked = "is_init" in policy.in_keys
@@ -182,14 +181,14 @@ def collect(
     Args:
         source: makes the environments.
         policy: the policy.
-        steps: how many at least, of all environments together.
-        environments: how many at once.
+        steps: minimum number of steps, all environments together.
+        environments: number of environments stepped at once.
         noise: see :class:`Exploration`.
-        seed: of resets and noise.
+        seed: seed of resets and noise.
         on_step: called with the number of new steps, for progress bars.
 
     Returns:
-        ``[environments, T]``; episodes follow each other in a row.
+        ``[environments, T]``; within a row, episodes follow each other.
     """
     env = source.several(environments, control=policy_transforms(policy, source.one))
     env.set_seed(stream_seed(seed, "collect") % 2**31)
@@ -210,7 +209,7 @@ def collect(
 
 
 def check_surroundings(env: EnvBase) -> None:
-    """Refuse an environment with a controller of its own.
+    """Refuse an environment that already has a controller.
 
     Raises:
         ValueError: naming it.
@@ -218,35 +217,33 @@ def check_surroundings(env: EnvBase) -> None:
     for transform in transforms_of(env):
         if isinstance(transform, CONTROLLERS):
             raise ValueError(
-                f"the environment brings {type(transform).__name__} along, beside which another "
-                "controller would act: give the environment without it"
+                f"the environment already has {type(transform).__name__}, and a second controller "
+                "would act beside it: give the environment without it"
             )
 
 
 def warn_of_disturbances(env: EnvBase) -> None:
-    """Data are to be of the undisturbed plant: a bias in them is nominal to the model."""
+    """Warn of disturbances in the data: the model would take a bias for nominal dynamics."""
     for transform in transforms_of(env):
         if callable(getattr(transform, "compensate", None)):
             warnings.warn(
-                f"the environment brings {type(transform).__name__} along: the model takes "
-                "it for the plant's, and L1 will not cancel it; give robustify the undisturbed "
-                "environment, and evaluate the disturbances",
+                f"the environment already has {type(transform).__name__}: the model takes it for "
+                "part of the plant, and L1 will not cancel it; give robustify the undisturbed "
+                "environment, and disturb it in the evaluation",
                 stacklevel=3,
             )
 
 
 def agreed_time_step(source: EnvironmentSource, dt: float | None) -> float:
-    """Time of a step in seconds, as given or else as the environment tells.
+    """Time of a step in seconds, as given or else as told by the environment.
 
     Raises:
-        ValueError: if it is not known, or the environment tells another.
+        ValueError: if it is unknown, or differs from the environment's.
     """
     name, told = source.name or "the environment", source.time_step()
     if dt is None:
         if told is None:
-            raise ValueError(
-                f"{name} does not tell the time of its steps: give dt (--dt), in seconds"
-            )
+            raise ValueError(f"{name} does not tell its time step: give dt (--dt), in seconds")
         return told
     if told is not None and abs(dt - told) > 1e-4 * told:
         raise ValueError(
@@ -258,24 +255,24 @@ def agreed_time_step(source: EnvironmentSource, dt: float | None) -> float:
 def recorded(
     data: TensorDictBase | ReplayBuffer | Sequence[TensorDictBase], env: EnvBase, dt: float
 ) -> TensorDictBase:
-    """Recorded steps in the form of :func:`collect`'s, what is no transition left out.
+    """Recorded steps in the form of :func:`collect`'s, with everything but transitions left out.
 
     Args:
         data: undisturbed transitions, see :func:`~torchrl_l1.dynamics.read_transitions`.
-        env: the environment that they are of.
-        dt: time of its steps in seconds; that of the data, where these hold one, may differ by
-            2 %, as clocks do.
+        env: the environment that they come from.
+        dt: time of its steps in seconds; if the data include a time step, it may differ by 2 %, as
+            clocks do.
 
     Returns:
         ``[rows, T]``, float32.
 
     Raises:
-        ValueError: if widths or the time of a step are not the environment's, or there are too few
+        ValueError: if widths or time step are not the environment's, or there are too few
             transitions.
     """
     check_time_step(data, dt, "the environment")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the fit, which reads them too, says what it drops
+        warnings.simplefilter("ignore")  # the fit reads them too and warns of what it drops
         found = read_transitions(data, dtype=torch.float32)
     count = len(found.data)
     for name, spec in (
@@ -285,8 +282,8 @@ def recorded(
         width = found.data[name].shape[-1] if count else 0
         if count < 2 or width != spec.shape[-1]:
             raise ValueError(
-                f"the data hold {count} transitions with an {name} of width {width}, and the "
-                f"environment has one of {spec.shape[-1]}: are they of this environment?"
+                f"the data hold {count} transitions with an {name} of width {width}, but the "
+                f"environment's has width {spec.shape[-1]}: are they from this environment?"
             )
     steps = found.data.set(("next", "done"), ~found.joined[:, None])
     rows = max(1, min(_ROWS, count // _ROWS))
@@ -315,7 +312,7 @@ def switch_rates(
     Args:
         model: the learned dynamics.
         observation: ``(N, T, n)``.
-        action: ``(N, T, m)``, at which the affine model is tested.
+        action: ``(N, T, m)``, where the affine model is tested.
         started: ``(N, T)`` bool, false where an episode begins.
         epsilon: tolerances ``(K,)``, state units.
 
@@ -348,19 +345,19 @@ def switch_rates(
 def epsilon_for(
     model: EnsembleDynamics, data: TensorDictBase, rate: float, most_steps: int = 2000
 ) -> tuple[float, float]:
-    """The tolerance with which the operating point switches at a rate along recorded steps.
+    """The tolerance at which the operating point switches at a given rate along recorded steps.
 
-    The interval that holds it is divided again and again, sixteen tolerances at a time: rates fall
-    with the tolerance.
+    The switch rate falls as the tolerance grows; the interval that contains the solution is refined
+    repeatedly, with sixteen tolerances at a time.
 
     Args:
         model: the learned dynamics.
         data: undisturbed steps ``[N, T]``.
         rate: switches per 1000 steps.
-        most_steps: how many steps are looked at.
+        most_steps: maximum number of steps used.
 
     Returns:
-        epsilon in state units, and the rate found with it.
+        epsilon in state units, and the rate that it gives.
     """
     length = max(2, min(data.shape[1], most_steps // data.shape[0]))
     part = data[:, :length]

@@ -1,4 +1,4 @@
-"""Episodes as films: of a policy, with L1 off or on, one or several side by side."""
+"""Films of episodes with L1 off or on, one or several side by side."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ SUFFIXES = (".mp4", ".gif")
 
 @dataclass(frozen=True)
 class Film:
-    """An episode in pictures.
+    """An episode as images.
 
     Attributes:
-        label: what is written on it.
+        label: the text written on the frames.
         frames: RGB images ``(height, width, 3)``, uint8, one for each step.
         total: the undiscounted return.
         ended: whether the episode terminated, as in a fall.
@@ -62,16 +62,15 @@ def film(
 ) -> Film:
     """Record an episode.
 
-    MuJoCo's environments are drawn off screen in a process of their own, others by their
-    ``render``.
+    MuJoCo environments are drawn off screen in a separate process, others by their ``render``.
 
     Args:
         robust: policy, model and environment.
         l1: ``"off"`` or one of the presets.
         disturbances: values by name.
-        steps: after which the episode is cut off.
-        seed: of reset and disturbances.
-        size: width and height in pixels, of MuJoCo's environments.
+        steps: number of steps after which the episode is cut off.
+        seed: seed of reset and disturbances.
+        size: width and height in pixels, for MuJoCo environments.
 
     Raises:
         RenderingUnavailable: if MuJoCo cannot draw here.
@@ -84,8 +83,8 @@ def film(
     mujoco_ = source.task is not None or _physics(source.one()) is not None
     if not mujoco_ and not source.renders:
         raise ValueError(
-            f"{source.name or 'the environment'} cannot be drawn: name one of Gymnasium's, of "
-            "dm_control's or of ours"
+            f"{source.name or 'the environment'} cannot be drawn: use one of Gymnasium or "
+            "dm_control, or a built-in task"
         )
     options: dict[str, Any] = {} if mujoco_ else {"render_mode": "rgb_array"}
     env = source.single(disturbances, control, **options)
@@ -97,10 +96,10 @@ def film(
     with torch.random.fork_rng(devices=[]), torch.no_grad():
         env.set_seed(stream_seed(seed, "play") % 2**31)
         seed_streams(seed, "play")
-        # Gymnasium asks for the package that draws as late as it draws.
+        # Gymnasium asks for its rendering package only when it first draws.
         with set_exploration_type(ExplorationType.DETERMINISTIC), making(source.name):
             data = env.rollout(steps, robust.policy, callback=record)
-    record()  # the last step, after which nothing is called
+    record()  # the last step, after which there is no callback
     ended = bool(data["next", "terminated"].any())
     frames = shown
     if source.task is not None:
@@ -166,7 +165,7 @@ def side_by_side(films: Sequence[Film]) -> list[np.ndarray]:
 
 
 def check_film(file: Path | None) -> None:
-    """Refuse, before any work, what cannot be written or shown here.
+    """Refuse, before any work, a film that cannot be written or shown here.
 
     Raises:
         ValueError: for another suffix, a missing package, or a machine without a display.
@@ -181,13 +180,13 @@ def check_film(file: Path | None) -> None:
 
 
 def _in_real_time(frames: Sequence[np.ndarray], dt: float) -> tuple[list[np.ndarray], float]:
-    """Frames of which no more than fifty come in a second, and the time of each, s."""
+    """At most fifty frames per second, and the time of each in seconds."""
     every = max(1, round(0.02 / dt))
     return list(frames)[::every], dt * every
 
 
 def write_film(frames: Sequence[np.ndarray], file: str | Path, dt: float) -> Path:
-    """Write frames in real time, as far as a player can follow.
+    """Write frames in real time, at no more than fifty per second.
 
     Args:
         frames: RGB images.
@@ -207,7 +206,7 @@ def write_film(frames: Sequence[np.ndarray], file: str | Path, dt: float) -> Pat
         return file
     frames, seconds = _in_real_time(frames, dt)
     ffmpeg = require("imageio_ffmpeg", "video")
-    height, width = (side - side % 2 for side in frames[0].shape[:2])  # as the format asks
+    height, width = (side - side % 2 for side in frames[0].shape[:2])  # the format needs even sides
     with TemporaryDirectory() as folder:
         film = Path(folder, "film.mp4")
         writer = ffmpeg.write_frames(
@@ -240,7 +239,7 @@ def show_film(frames: Sequence[np.ndarray], dt: float, title: str) -> None:
             continue
     else:
         raise ValueError(
-            "no toolkit of windows is installed (such as python3-tk): give --output FILE.mp4"
+            "no window toolkit is installed (such as python3-tk): give --output FILE.mp4"
         )
     frames, seconds = _in_real_time(frames, dt)
     height, width = frames[0].shape[:2]

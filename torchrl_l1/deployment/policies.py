@@ -39,31 +39,31 @@ FORMS = ", ".join(
         *("MODULE:NAME", "FILE.py:NAME", "or a run directory"),
     ]
 )
-"""What sources there are, in words."""
+"""The kinds of sources, in words."""
 
 
 class FunctionPolicy(TensorDictModuleBase):
     """A policy that is a function of the observation, as a TorchRL module.
 
-    It reads ``observation`` and writes ``action``, on batches as on single observations. What the
-    function takes is found out by two observations near zero: tensors or else NumPy's arrays, and
-    batches where it does with them what it does with each observation by itself.
+    It reads ``observation`` and writes ``action``, for batches or single observations. Two
+    observations near zero show what the function takes: tensors or else NumPy arrays, and batches
+    if it treats them like each observation by itself.
 
     Args:
         function: from an observation ``(n,)``, or several ``(N, n)``, to actions as a tensor, an
-            array or numbers. Modules get their own type of numbers, and stay in train or
-            evaluation mode as they are.
-        observation: spec of the observation, its last dimension n.
-        action: spec of the action, whose shape, type and bounds count.
-        rows: whether the function takes one observation at a time; found out if ``None``.
+            array or numbers. Modules receive their own dtype and stay in train or evaluation mode
+            as they are.
+        observation: spec of the observation, with last dimension n.
+        action: spec of the action, which sets shape, dtype and bounds.
+        rows: whether the function takes one observation at a time; detected if ``None``.
 
     Attributes:
         rows: whether it is called for each observation by itself.
         arrays: whether it is called with arrays.
 
     Warns:
-        UserWarning: if the function gives another action for the same observation when it is
-            called again.
+        UserWarning: if the function gives a different action when called again with the same
+            observation.
 
     Raises:
         ValueError: if the function returns no action.
@@ -105,15 +105,15 @@ class FunctionPolicy(TensorDictModuleBase):
     def _find_out(self, n: int, forms: Sequence[bool]) -> None:
         probe = torch.linspace(-0.1, 0.1, 2 * n).reshape(2, n)
         causes: list[str] = []
-        # NumPy's functions take tensors, with a warning of theirs: arrays are what they are for.
+        # NumPy functions accept tensors, with a deprecation warning: give them arrays instead.
         for self.arrays, strict in ((False, True), (True, True), (False, False)):
             with warnings.catch_warnings():
                 if strict:
                     warnings.simplefilter("error", DeprecationWarning)
                 found = {rows: self._tried(probe, rows, causes) for rows in forms}
                 together, alone = found.get(False), found.get(True)
-                # Where rows and columns are confused, or a mean is over the batch, the shape may
-                # be right.
+                # The shape may be right even if the function confuses rows and columns or takes a
+                # mean over the batch.
                 self.rows = together is None or not (alone is None or _close(together, alone))
                 first = alone if self.rows else together
                 if first is not None:
@@ -123,10 +123,10 @@ class FunctionPolicy(TensorDictModuleBase):
             raise ValueError(f"the policy {causes[-1]}")
         if again is None or not _close(first, again):
             warnings.warn(
-                "the policy gives another action for the same observation when it is called again: "
+                "the policy gives a different action when called again with the same observation: "
                 "results vary if it draws at random, and are wrong if it remembers earlier calls, "
-                "which are those of several environments in turn; a memory belongs into the "
-                "tensordict, by a TorchRL module with make_tensordict_primer",
+                "which come from several environments in turn; a memory belongs in the "
+                "tensordict: use a TorchRL module with make_tensordict_primer",
                 stacklevel=4,
             )
 
@@ -135,7 +135,7 @@ class FunctionPolicy(TensorDictModuleBase):
         n = probe.shape[-1]
         try:
             found = [self._call(one) for one in (probe if rows else [probe])]
-        except Exception as error:  # of a function that does not know this form, anything
+        except Exception as error:  # a function that does not take this form may raise anything
             causes.append(f"failed at an observation of width {n}: {_short(error)}")
             return None
         if rows and all(action.numel() == self.width for action in found):
@@ -151,7 +151,7 @@ class FunctionPolicy(TensorDictModuleBase):
     def _call(self, observation: Tensor) -> Tensor:
         if isinstance(self.function, nn.Module):
             observation = observation.to(_number_type(self.function) or observation.dtype)
-        # Copies: a function may work on what it is given, and return the same memory each time.
+        # Copies: a function may change its argument, and return the same memory each time.
         observation = observation.clone()
         given: Any = observation.numpy() if self.arrays else observation
         found: Any = self.function(given)
@@ -203,23 +203,22 @@ def load_policy(
     a run directory      the policy of the run's last stage
     ==================== ===========================================================
 
-    TorchRL modules, models of Stable-Baselines3 and functions of the observation are taken as
-    objects, too. Files of Stable-Baselines3 hold pickles, which execute code when they are
-    loaded: open those only that you trust.
+    TorchRL modules, models of Stable-Baselines3 and functions of the observation are also accepted
+    as objects. Files of Stable-Baselines3 contain pickles, which execute code when they are loaded:
+    open only those that you trust.
 
     Args:
         policy: a source or an object.
-        env: the environment that it is for, see
-            :func:`~torchrl_l1.envs.vector_environment`.
-        normalization: file of the statistics of VecNormalize, a pickle, or ``"none"``.
-        weights: file of a state dict to load into the module; pickles are refused in it.
-        search_path: folders for ``FILE.py`` and ``MODULE``, before the working directory.
+        env: its environment, see :func:`~torchrl_l1.envs.vector_environment`.
+        normalization: file with the statistics of VecNormalize, a pickle, or ``"none"``.
+        weights: file with a state dict to load into the module; other pickled objects are refused.
+        search_path: folders to search for ``FILE.py`` and ``MODULE`` before the working directory.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the weights are not those of the module, for a file that cannot be read, a
-            source that stands for nothing, a file beside it that changes what the
-            policy sees and is not mentioned, or a policy that returns no action.
+        ValueError: for weights that do not fit the module, a file that cannot be read, an unknown
+            source, a file of VecNormalize beside the policy's that ``normalization`` does not
+            mention, or a policy that returns no action.
     """
     if normalization is not None and not (isinstance(policy, str) and policy.startswith("sb3:")):
         raise ValueError("normalization belongs to policies of Stable-Baselines3, sb3:FILE.zip")
@@ -228,26 +227,24 @@ def load_policy(
         found = _from_source(policy, normalization, search_path)
     predicts = getattr(found, "predict", None)
     if callable(predicts) and hasattr(getattr(found, "policy", None), "squash_output"):
-        # A model of Stable-Baselines3, which knows the normaliser that it was trained behind.
+        # A model of Stable-Baselines3 knows the normaliser that it was trained with.
         check_spaces(found.policy)
         found = StableBaselinesPolicy(
             found.policy, moments(getattr(found, "get_vec_normalize_env", lambda: None)())
         )
     if weights is not None:
         if not isinstance(found, nn.Module):
-            raise ValueError(
-                f"weights go into a module, and the policy is a {type(found).__name__}"
-            )
+            raise ValueError(f"weights need a module, but the policy is a {type(found).__name__}")
         try:
             stored = torch.load(weights, map_location="cpu", weights_only=True)
         except pickle.UnpicklingError:
             raise ValueError(
-                f"{weights} is no state dict, or holds more than its tensors, and loading that "
-                "would execute what is in it: save module.state_dict()"
+                f"{weights} is not a state dict, or holds more than tensors, and loading it would "
+                "execute its contents: save module.state_dict()"
             ) from None
         except (EOFError, RuntimeError, LookupError, TypeError, AttributeError) as error:
-            # What is read as a pickle and is none may end in any of these.
-            raise ValueError(f"{weights} is no state dict: {_short(error)}") from error
+            # Reading a file that is not a pickle may raise any of these.
+            raise ValueError(f"{weights} is not a state dict: {_short(error)}") from error
         try:
             found.load_state_dict(stored)
         except (RuntimeError, TypeError, AttributeError) as error:
@@ -258,7 +255,7 @@ def load_policy(
         _check_keys(found, env)
         return found
     if not callable(found):
-        raise ValueError(f"a {type(found).__name__} is no policy; policies are {FORMS}")
+        raise ValueError(f"a {type(found).__name__} is not a policy; policies are {FORMS}")
     action = env.full_action_spec["action"]
     if isinstance(found, StableBaselinesPolicy):
         _warn_of_bounds(found, action)
@@ -266,7 +263,7 @@ def load_policy(
 
 
 def _check_mode(policy: nn.Module) -> None:
-    """Refuse a policy in train mode that normalises by the batch, and tell of one that draws."""
+    """Refuse a policy in train mode with batch normalisation, and warn of one with dropout."""
     for name, layer in policy.named_modules():
         if not getattr(layer, "training", False):
             continue
@@ -281,13 +278,13 @@ def _check_mode(policy: nn.Module) -> None:
 
 
 def _check_keys(policy: TensorDictModuleBase, env: EnvBase) -> None:
-    """Refuse a module that reads what the environment has not, or writes no action."""
+    """Refuse a module that reads keys the environment does not have, or writes no action."""
     if any(isinstance(module, L1Controller) for module in policy.modules()):
-        raise ValueError("the policy has an L1Controller of its own: give the actor without it")
+        raise ValueError("the policy already has an L1Controller: give the actor without it")
     if "action" not in unravel_key_list(policy.out_keys):
         raise ValueError(
             f"the policy writes {list(policy.out_keys)} and no 'action': wrap it in a module that "
-            "does, or rename its output"
+            "writes one, or rename its output"
         )
     primers = get_primers_from_module(policy, warn=False)
     specs = [env.full_observation_spec, env.full_state_spec]
@@ -317,7 +314,7 @@ def _from_source(source: str, normalization: str | None, search_path: Sequence[s
             return FILE_KINDS[kind].read(Path(rest), normalization)
         except (ValueError, ImportError, FileNotFoundError):
             raise
-        except Exception as error:  # of a foreign file, anything
+        except Exception as error:  # reading a foreign file may raise anything
             raise ValueError(f"{rest} cannot be read as {kind}: {_short(error)}") from error
     if Path(source).is_dir() or (kept_by(Path(source)) and Path(source).is_file()):
         return list(load_run(source).algorithm.policies.values())[-1]
@@ -337,13 +334,13 @@ def _from_code(source: str, search_path: Sequence[str]) -> Any:
             if parameter.default is parameter.empty
             and parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
         ]
-    except ValueError:  # built in
+    except ValueError:  # a built-in function
         return found
     return found if needed else found()
 
 
 def _warn_of_bounds(policy: StableBaselinesPolicy, action: TensorSpec) -> None:
-    """Say that a policy acts in other units than the environment, as far as bounds tell."""
+    """Warn if the bounds show that a policy acts in other units than the environment."""
     if not isinstance(action, Bounded) or policy.low.shape != action.shape[-1:]:
         return
     theirs = action.space.low, action.space.high

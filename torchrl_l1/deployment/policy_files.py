@@ -1,4 +1,4 @@
-"""Policies that are files: how each kind is read, and copied."""
+"""Policies stored in files: how each kind is read and copied."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torchrl_l1.envs.references import require
 
 NO_NORMALIZATION = "none"
-"""In place of the file of VecNormalize: there is one, and it is to be left alone."""
+"""Given instead of a file of VecNormalize to say that the one found is not to be used."""
 
 
 class StableBaselinesPolicy(nn.Module):
@@ -65,7 +65,7 @@ class StableBaselinesPolicy(nn.Module):
 
 def _torchscript(file: Path) -> Any:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch's own, that TorchScript is no longer developed
+        warnings.simplefilter("ignore")  # torch's notice that TorchScript is deprecated
         return torch.jit.load(str(file), map_location="cpu").eval()
 
 
@@ -86,9 +86,9 @@ def _onnx(file: Path) -> Any:
 
 
 def _whole_onnx(file: Path) -> bytes:
-    """A model with what it keeps in other files."""
+    """A model together with the data that it keeps in other files."""
     content = file.read_bytes()
-    if b"location" in content:  # by which it names other files
+    if b"location" in content:  # the field that names other files
         content = require("onnx", "onnx").load(str(file)).SerializeToString()
     return content
 
@@ -98,9 +98,9 @@ def _stable_baselines(file: Path, normalization: str | None) -> StableBaselinesP
     beside = _statistics(file)
     if normalization is None and beside is not None:
         raise ValueError(
-            f"{beside} stands beside {file.name}: give it as normalization (--normalization "
-            f"{beside}), which loads a pickle and so executes what is in it, or say "
-            f"{NO_NORMALIZATION!r} if the policy does without"
+            f"{beside} lies beside {file.name}: give it as normalization (--normalization "
+            f"{beside}), which loads a pickle and so executes its contents, or say "
+            f"{NO_NORMALIZATION!r} if the policy does not use it"
         )
     with zipfile.ZipFile(file) as archive:
         home = json.loads(archive.read("data"))["policy_class"]["__module__"]
@@ -114,25 +114,26 @@ def _stable_baselines(file: Path, normalization: str | None) -> StableBaselinesP
 
 
 def _statistics(file: Path) -> Path | None:
-    """A file that is named like VecNormalize's, beside a model or in the folder of its name."""
+    """A file named like those of VecNormalize, beside a model or in the folder of its name."""
     found = [
         one
         for folder in (file.parent, file.with_suffix(""))
         for one in folder.glob("*.pkl")
         if "vecnorm" in one.name.lower().replace("_", "").replace("-", "")
     ]
-    # CheckpointCallback writes one for each of its models, named alike.
+    # CheckpointCallback writes one for each of its models, with matching names.
     found.sort(key=lambda one: (one.stem.replace("vecnormalize_", "") != file.stem, one))
     return found[0] if found else None
 
 
 def check_spaces(policy: Any) -> None:
-    """Refuse a policy of Stable-Baselines3 that is none of vectors, before its inside is read."""
+    """Refuse a policy of Stable-Baselines3 whose spaces are not vectors, before it is used."""
     for what, space in (("reads", policy.observation_space), ("acts in", policy.action_space)):
         if not isinstance(space, Box) or len(space.shape) != 1:
             raise ValueError(
-                f"the policy {what} {space}: it must read and give vectors of numbers, each a Box "
-                "of one dimension; wrap what joins or splits them as a function of the observation"
+                f"the policy {what} {space}: it must read and return vectors, each a Box of one "
+                "dimension; wrap a policy that joins or splits them as a function of the "
+                "observation"
             )
 
 
@@ -149,7 +150,7 @@ def moments(normalize: Any) -> tuple[Tensor, Tensor, float, float] | None:
 
 
 def _algorithm(home: str) -> Any:
-    """The class of the model, from the module that its policy's class is of."""
+    """The class of the model, found through the module of its policy's class."""
     package, *inner = home.split(".")
     if package in ("stable_baselines3", "sb3_contrib") and inner[0] != "common":
         algorithms = import_module(f"{package}.{inner[0]}")
@@ -158,18 +159,18 @@ def _algorithm(home: str) -> Any:
             for name, value in vars(algorithms).items()
             if name.lower() == inner[0].lower() and inspect.isclass(value)
         )
-    # Of algorithms whose policies are the common ones the class makes no difference.
+    # For algorithms with the common policies, the class makes no difference.
     return import_module("stable_baselines3").PPO
 
 
 class FileKind(NamedTuple):
-    """One kind of policies that are files.
+    """One kind of policy file.
 
     Attributes:
-        read: the policy of a file, given what normalises its observations, if anything.
-        is_code: whether reading it executes what is in it.
-        form: how its files are named, in words.
-        content: of a copy that needs no other file.
+        read: reads the policy from a file, given the statistics for its observations, if any.
+        is_code: whether reading it executes its contents.
+        form: how its files are named.
+        content: contents of a copy that needs no other file.
     """
 
     read: Callable[[Path, str | None], Any]
@@ -183,4 +184,4 @@ FILE_KINDS = {
     "torchscript": FileKind(lambda file, _: _torchscript(file), is_code=False),
     "onnx": FileKind(lambda file, _: _onnx(file), is_code=False, content=_whole_onnx),
 }
-"""By the word before the colon."""
+"""Kinds of policy files by the word before the colon."""

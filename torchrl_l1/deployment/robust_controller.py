@@ -1,4 +1,4 @@
-"""A policy with L1 around it: its environments, its evaluation, and its files."""
+"""A policy with L1 around it: its environments, its evaluation and its files."""
 
 from __future__ import annotations
 
@@ -47,21 +47,21 @@ from torchrl_l1.experiment.l1_options import OFF, closest_option, l1_option
 from torchrl_l1.experiment.settings import l1_config
 
 PRESETS = ("robust", "paper")
-"""Settings of L1 that a policy can be given, the default first."""
+"""Presets of L1 for a policy, the default first."""
 
 
 @dataclass
 class RobustController:
-    """A policy with a model of what it acts on, and L1 around it; :func:`robustify` makes it.
+    """A policy with a model of its environment and L1 around it; made by :func:`robustify`.
 
     Attributes:
         source: makes its environments.
         policy: reads ``observation`` and writes ``action``.
         model: the learned dynamics.
         configs: settings of L1 by preset, bounds of the action included.
-        preset: the one that acts by default.
-        origin: how the policy is found again, with ``search_path``, the folders of what
-            policy and environment are named by, and ``code``, digests of it.
+        preset: the default preset.
+        origin: how to find the policy again, with ``search_path``, the folders of the code that
+            policy and environment name, and ``code``, its digests.
     """
 
     source: EnvironmentSource
@@ -73,18 +73,19 @@ class RobustController:
 
     @property
     def config(self) -> L1Config:
-        """The settings of L1 that act by default."""
+        """The default settings of L1."""
         return self.configs[self.preset]
 
     def wrap(self, env: EnvBase, preset: str | None = None) -> TransformedEnv:
         """An environment with L1 between it and the policy.
 
         Args:
-            env: as :func:`robustify` was given, or with disturbances on it, batched or not.
-            preset: the settings; those that act by default if ``None``.
+            env: the one given to :func:`robustify`, or one with disturbances, batched or not.
+            preset: the settings; the default preset if ``None``.
 
         Returns:
-            with an ``L1Transform`` as its last transform: ``env.rollout(1000, robust.policy)``.
+            the environment with an ``L1Transform`` as its last transform:
+            ``env.rollout(1000, robust.policy)``.
         """
         config = self.settings(preset)
         env = TransformedEnv(self._joined(env), auto_unwrap=True)
@@ -96,16 +97,16 @@ class RobustController:
         return env
 
     def _joined(self, env: EnvBase) -> EnvBase:
-        """With the parts of the observation in the policy's order, if they are not joined yet."""
+        """Join the parts of the observation in the policy's order, if that is not done yet."""
         there = getattr(env, "full_observation_spec", {}).get("observation", None)
         is_whole = there is not None and there.shape[-1] == self.model.observation_dim
         return vector_environment(env, () if is_whole else self.source.observation_keys)
 
     def settings(self, preset: str | None) -> L1Config:
-        """The settings of a preset; those that act by default if ``None``.
+        """The settings of a preset; of the default preset if ``None``.
 
         Raises:
-            ValueError: for a preset that there is not, or where there is no L1.
+            ValueError: for an unknown preset, or if there is no L1.
         """
         if not self.configs:
             raise ValueError("a policy in an environment has no L1: robustify it first")
@@ -125,18 +126,18 @@ class RobustController:
         """Test the policy under disturbances: L1 off, each preset, and the oracle.
 
         All see the same resets. The oracle, which is told the disturbance, is tested where
-        disturbances are matched, and says what is possible.
+        disturbances are matched, and shows what is possible.
 
         Args:
             disturbances: values by name, ``{"bias": [0.5, 1.0]}``, or a suite, ``"quick"``; see
                 :data:`~torchrl_l1.envs.DISTURBANCES`.
-            episodes: in each cell.
-            most_steps: after which an episode is cut off.
-            seed: of the resets and of what disturbances draw.
-            progress: whether to show a bar; if ``None``, where there is a terminal.
+            episodes: number of episodes per cell.
+            most_steps: number of steps after which an episode is cut off.
+            seed: seed of resets and random disturbances.
+            progress: whether to show a bar; if ``None``, only on a terminal.
 
         Raises:
-            ValueError: for what is no disturbance, or cannot act on the environment.
+            ValueError: for a disturbance that is unknown or cannot act on the environment.
         """
         check_count("episodes", episodes)
         check_count("most_steps", most_steps)
@@ -154,9 +155,9 @@ class RobustController:
             )  # fmt: skip
 
     def save(self, folder: str | Path) -> Path:
-        """Write model, settings and, where the policy came from a file, that file to a folder.
+        """Write model, settings and, if the policy came from a file, that file to a folder.
 
-        There are no pickles of ours among them; the policy's own files are what they were.
+        The files written for L1 contain no pickles; the policy's own files are copied as they are.
 
         Returns:
             the folder.
@@ -209,12 +210,12 @@ class RobustController:
 
         Raises:
             FileNotFoundError: if there is no such folder.
-            ValueError: for a file that is damaged or of another version, or that is not to be
-                trusted and names what would be run.
+            ValueError: for a file that is damaged or of another version, or an untrusted folder
+                that names code to run.
             ValueError: if environment or policy were given as objects, which no folder holds, and
                 are not given again.
-            ValueError: for a file in it that is not the one that was saved with the settings, as
-                after a ``save`` that was broken off.
+            ValueError: for a file that was not saved with the settings, as after an interrupted
+                ``save``.
 
         Warns:
             UserWarning: if code that the folder names has changed since.
@@ -228,8 +229,10 @@ class RobustController:
         check_files(folder, stored.get("files") or {})
         for what, value in (("make_env", make_env), ("policy", policy)):
             if value is None and not stored["environment" if what == "make_env" else what]:
-                raise ValueError(f"{folder} names no {what}, which was an object: give it again")
-        # What is named anew is looked for here first.
+                raise ValueError(
+                    f"{folder} does not name the {what}, which was an object: give it again"
+                )
+        # Newly given names are looked up here first.
         anew = [name for name in (make_env, policy) if isinstance(name, str)]
         search_path = [*folders_of(anew, [Path.cwd()]), *(stored.get("search_path") or ())]
         names = {key: stored.get(key) for key in ("policy", "normalization", "weights")}
@@ -248,7 +251,7 @@ class RobustController:
         if changed:
             warnings.warn(
                 f"{', '.join(changed)} changed since the controller {folder} was made: robustify "
-                "the policy again if it acts otherwise",
+                "the policy again if it acts differently now",
                 stacklevel=2,
             )
         source = source_for(named, policy, search_path)
@@ -265,7 +268,7 @@ class RobustController:
 def source_for(
     make_env: MakeEnv, policy: Policy, search_path: Sequence[str] = ()
 ) -> EnvironmentSource:
-    """The environment, with the parts of its observation in the order of a run's policy."""
+    """The environment, with the parts of its observation in the order that a run's policy reads."""
     settings = settings_of_run(policy)
     if make_env != settings.get("task"):
         return environment_source(make_env, search_path)
@@ -280,27 +283,27 @@ def load_target(
     weights: str | None = None,
     trusted: bool = False,
 ) -> RobustController:
-    """What a command is about: a controller, a run, or a policy in its environment.
+    """Load the target of a command: a controller, a run, or a policy in its environment.
 
     Args:
-        target: a folder that :func:`robustify`'s command or :meth:`RobustController.save` wrote, a
-            run directory, whose own model and settings count, or an environment by name.
+        target: a folder written by ``torchrl-l1 robustify`` or :meth:`RobustController.save`, a
+            run directory, whose own model and settings are used, or an environment by name.
         policy: the policy in that environment, which then has no L1.
         normalization: see :func:`load_policy`.
         weights: likewise.
-        trusted: whether functions and pickles that a folder names may be run, those of a run in its
-            settings; what is named here is run in any case.
+        trusted: whether functions and pickles named in a folder, or in the settings of a run, may
+            be run; those named in the arguments are always run.
 
     Raises:
-        ValueError: if it is none of them, a policy or a file of one is given beside a folder, or a
-            folder that is not to be trusted names what would be run.
+        ValueError: if the target is none of these, a policy or one of its files is given beside a
+            folder, or an untrusted folder names code to run.
     """
     folder = Path(target)
     if folder.is_dir() or (kept_by(folder) and folder.is_file()):
         given = {"policy": policy, "normalization": normalization, "weights": weights}
         for name, value in given.items():
             if value is not None:
-                raise ValueError(f"{target} has a policy of its own: leave --{name} out")
+                raise ValueError(f"{target} has its own policy: leave --{name} out")
         for place in (folder, folder / "controller"):
             if (place / FILE).exists():
                 return RobustController.load(place, trusted=trusted)
@@ -320,7 +323,7 @@ def load_target(
 
 
 def _of_run(folder: Path) -> RobustController:
-    """A training with its own model; with its own L1, where it has one of that kind."""
+    """A trained run with its own model and, where it has one of a preset's kind, its own L1."""
     run = load_run(folder)
     own, task = run.recipe.l1, run.algorithm.task
     trained_with = closest_option(own, task)
@@ -345,13 +348,13 @@ def _of_run(folder: Path) -> RobustController:
 
 @contextmanager
 def private_randomness() -> Iterator[None]:
-    """What is drawn inside leaves torch's global generator as it was."""
+    """Leave torch's global generator untouched by random draws inside."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         yield
 
 
 def progress_bar(words: str, unit: str, progress: bool | None) -> tqdm:
-    """A bar, or none; if ``None``, one where there is a terminal."""
+    """A progress bar, or none; if ``None``, one only on a terminal."""
     disable = None if progress is None else not progress
     return tqdm(desc=words, unit=unit, disable=disable)

@@ -1,4 +1,4 @@
-"""From a policy to a robust one: collect, fit, calibrate."""
+"""From a policy to a robust controller: collect, fit, calibrate."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ from torchrl_l1.envs.references import folders_of
 from torchrl_l1.envs.sources import MakeEnv
 
 MODEL: Mapping[str, Any] = {"hidden": (128, 128)}
-"""Arguments of :func:`~torchrl_l1.dynamics.make_dynamics` where none are given."""
+"""Default arguments of :func:`~torchrl_l1.dynamics.make_dynamics`."""
 
 FIT = FitConfig(max_epochs=200, max_gradient_steps=2000, patience=10, batch_size=256)
-"""How the model is fitted where nothing else is said."""
+"""Default settings for fitting the model."""
 
 
 def robustify(
@@ -62,35 +62,35 @@ def robustify(
 ) -> RobustController:
     """Put L1 around a policy: collect data with it, fit a model, calibrate the controller.
 
-    The policy stays as it is. Nothing need be known of the disturbances, which are not in the
-    data.
+    The policy stays as it is. The disturbances need not be known, and the data are undisturbed.
 
     Args:
         make_env: an environment by name, or a function that makes one, see
             :func:`environment_source`.
         policy: a source, a module or a function, see :func:`load_policy`.
-        steps: steps of the environment that are collected, with exploration noise.
-        preset: ``"robust"`` or ``"paper"``, the settings of L1 that act by default; both are
-            calibrated and evaluated.
+        steps: number of environment steps to collect, with exploration noise.
+        preset: ``"robust"`` or ``"paper"``, the default settings of L1; both are calibrated and
+            evaluated.
         dt: time of a step in seconds; the environment's own if ``None``.
-        epsilon: tolerance of the paper's switching law, state units.
-        switch_rate: switches per 1000 steps that epsilon is found from otherwise; if ``None``, in
-            the middle of the paper's rule of thumb, see :func:`target_switch_rate`.
-        data: undisturbed transitions to learn from in place of steps that are collected, see
-            :func:`~torchrl_l1.dynamics.fit_dynamics`; the environment is then for the tests alone.
+        epsilon: tolerance of the paper's switching law, in state units; if ``None``, found from
+            ``switch_rate``.
+        switch_rate: target for epsilon, in switches per 1000 steps; if ``None``, the middle of the
+            paper's rule of thumb, see :func:`target_switch_rate`.
+        data: undisturbed transitions to learn from instead of collecting steps, see
+            :func:`~torchrl_l1.dynamics.fit_dynamics`; the environment is then only used for tests.
         normalization: statistics of VecNormalize, see :func:`load_policy`.
         weights: state dict of the policy, see :func:`load_policy`.
-        environments: environments that are stepped at once.
-        noise: exploration, as a fraction of half the range of the action, see :class:`Exploration`.
-        model: arguments of :func:`~torchrl_l1.dynamics.make_dynamics` beside the widths.
-        fit: how the model is fitted.
-        seed: of data and weights; torch's global generator is left as it was.
-        progress: whether to show bars and print what the model is worth; if ``None``, bars where
-            there is a terminal.
+        environments: number of environments stepped at once.
+        noise: exploration noise as a fraction of half the action range, see :class:`Exploration`.
+        model: arguments of :func:`~torchrl_l1.dynamics.make_dynamics` except the widths.
+        fit: settings for fitting the model.
+        seed: seed of data and weights; torch's global generator is left untouched.
+        progress: whether to show bars; if ``None``, only on a terminal. Unless it is false, the
+            quality of the model is printed.
 
     Raises:
-        ValueError: for a setting out of its domain, an environment that does not tell its time
-            step, tells another or has a controller already, observations and actions that are no
+        ValueError: for an invalid setting, an environment whose time step is unknown or differs
+            from ``dt``, or that already has a controller, observations or actions that are not
             vectors, or a policy whose actions do not fit.
 
     Examples:
@@ -112,7 +112,7 @@ def robustify(
         check_not_negative("epsilon", epsilon)
     search_path = folders_of([n for n in (make_env, policy) if isinstance(n, str)], [Path.cwd()])
     code = code_of((make_env, policy), search_path)
-    with private_randomness():  # environments may draw a seed as they are made
+    with private_randomness():  # environments may draw a seed on creation
         source = source_for(make_env, policy)
         dt = agreed_time_step(source, dt)
     with private_randomness():

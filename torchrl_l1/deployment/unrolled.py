@@ -1,4 +1,4 @@
-"""Triangular factors and solutions of the few rows of a state, unrolled: ONNX has none."""
+"""Triangular factors and solves, unrolled over the few rows of a state: ONNX has none."""
 
 from __future__ import annotations
 
@@ -66,4 +66,4 @@ UNROLLED: dict[Any, Callable[..., Any]] = {
     _aten.linalg_solve_triangular.default: solve_triangular,
     _aten.cholesky_solve.default: cholesky_solve,
 }
-"""By the operation of torch that each stands for."""
+"""Replacements by the torch operation that each stands for."""

@@ -1,4 +1,4 @@
-"""Checkpoints: kept as asked, and read with every byte checked, or refused in one line."""
+"""Checkpoints: kept as requested, and read with every byte checked, or refused in one line."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.files import copy_in_place
 
 KEPT = "checkpoints"
-"""Folder in a run directory of the checkpoints that a recipe keeps."""
+"""Folder in a run directory for the checkpoints that a recipe keeps."""
 
 
 @dataclass
 class CheckpointSettings:
-    """Checkpoints that are kept, beside the last one and the one before it.
+    """Checkpoints to keep besides the last two.
 
     Attributes:
-        every: outer iterations after which one is kept, again and again; none if null.
-        best: whether that of the highest ``return_mean`` is kept.
+        every: keep one every so many outer iterations; none if null.
+        best: whether to keep that of the highest ``return_mean``.
     """
 
     every: int | None = None
@@ -37,7 +37,7 @@ class CheckpointSettings:
 
 @contextmanager
 def single_precision() -> Iterator[None]:
-    """Torch's default type as runs have it, whichever a session has chosen before and after."""
+    """Torch's default dtype as in runs, whatever it is before and after."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float32)
     try:
@@ -50,21 +50,21 @@ _ENTRIES = {"algorithm": dict, "metrics": list, "timings": list}
 
 
 def read_checkpoint(file: Path) -> dict[str, Any]:
-    """A checkpoint as ``torch.load`` gives it, with the checksums of all its parts compared.
+    """A checkpoint as ``torch.load`` returns it, after comparing the checksums of all its parts.
 
-    Only tensors and plain values are read: no code of the file's is run.
+    Only tensors and plain values are read: no code in the file is run.
 
     Raises:
         RunDirectoryError: naming the file and what is wrong with it.
     """
     try:
         if not file.is_file():
-            raise ValueError("it is no file")
+            raise ValueError("it is not a file")
         if file.stat().st_size == 0:
             raise ValueError("it is empty")
         if not zipfile.is_zipfile(file):
-            raise ValueError("it is cut off, or no checkpoint at all")
-        # torch itself compares no checksums when it reads.
+            raise ValueError("it is cut off, or not a checkpoint at all")
+        # torch itself does not compare checksums on reading.
         with zipfile.ZipFile(file) as archive:
             broken = archive.testzip()
         if broken is not None:
@@ -73,7 +73,7 @@ def read_checkpoint(file: Path) -> dict[str, Any]:
             warnings.simplefilter("ignore")
             state = torch.load(file, weights_only=True, map_location="cpu")
         if not isinstance(state, dict):
-            raise ValueError(f"it holds a {type(state).__name__}, no checkpoint")
+            raise ValueError(f"it holds a {type(state).__name__}, not a checkpoint")
         for name, kind in _ENTRIES.items():
             if not isinstance(state.get(name), kind):
                 raise ValueError(f"it has no {name}")
@@ -85,7 +85,7 @@ def read_checkpoint(file: Path) -> dict[str, Any]:
         raise RunDirectoryError(
             f"{file} cannot be read: it holds more than tensors and values; that is not run"
         ) from error
-    # Damage takes any form: what zipfile, pickle and torch raise of it has no common class.
+    # Damage takes any form: the errors of zipfile, pickle and torch have no common class.
     except Exception as error:
         why = " ".join(str(error).split())[:200] or type(error).__name__
         raise RunDirectoryError(f"{file} cannot be read: {why}") from error
@@ -98,7 +98,7 @@ def checkpoint_of(
     timings: list[dict[str, Any]],
     settings: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """What is kept of a run: the algorithm's state, its tables, and what they were made with."""
+    """The contents of a checkpoint: the algorithm's state, tables, configuration and versions."""
     return {
         "algorithm": state,
         "metrics": rows,
@@ -116,7 +116,7 @@ def load_state(algorithm: Algorithm, state: dict[str, Any], file: Path) -> None:
     """
     try:
         algorithm.load_state_dict(state)
-    # Of a foreign state anything may be missing.
+    # In a foreign state anything may be missing.
     except Exception as error:
         why = " ".join(str(error).split())[:200]
         raise RunDirectoryError(f"{file} does not fit the run: {why}") from error
@@ -128,13 +128,13 @@ def keep_checkpoints(
     rows: Sequence[Mapping[str, Any]],
     say: Callable[[str], object] = lambda line: None,
 ) -> None:
-    """Keep the last checkpoint, where it is one that a recipe keeps, in the folder :data:`KEPT`.
+    """Keep the last checkpoint in the folder :data:`KEPT`, if the recipe says so.
 
     Args:
         last: the run's last checkpoint.
-        settings: which are kept.
+        settings: which checkpoints to keep.
         rows: rows of the metrics, as in that checkpoint.
-        say: told in a line where the best one is gone, since none was kept at its time.
+        say: receives a line if the best checkpoint is gone because none was kept at its time.
     """
     names = []
     if settings.every is not None and rows and len(rows) % settings.every == 0:
@@ -154,7 +154,7 @@ def keep_checkpoints(
 
 
 def kept_by(path: Path) -> Path | None:
-    """The run directory that a kept checkpoint is of; ``None`` if a path is no such file."""
+    """The run directory of a kept checkpoint; ``None`` if the path is not one."""
     if path.suffix != ".pt" or path.parent.name != KEPT or path.is_dir():
         return None
     return path.parent.parent

@@ -1,4 +1,4 @@
-"""Episodes of environments, and the datasets that are written of them."""
+"""Episodes of environments, and writing them as datasets."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Episode:
         actions: ``(L, m)``.
         rewards: ``(L,)``.
         terminations: ``(L,)``, bool.
-        truncations: ``(L,)``, bool; the last one is true where nothing else has ended it.
+        truncations: ``(L,)``, bool; the last is true if nothing else ended the episode.
     """
 
     observations: np.ndarray
@@ -48,8 +48,8 @@ class Episode:
 def split_episodes(data: TensorDictBase) -> list[Episode]:
     """The episodes in ``[N, T]`` steps of environments, in order.
 
-    An episode that the end of the data cuts off is truncated there. A step that the simulator
-    could not take did not happen, and the episode is truncated before it.
+    An episode cut off by the end of the data is truncated there. A step that the simulator could
+    not take is dropped, and the episode is truncated before it.
     """
     columns = {
         "action": data["action"].float(),
@@ -78,20 +78,20 @@ def split_episodes(data: TensorDictBase) -> list[Episode]:
 
 
 def write_dataset(output: str, episodes: Sequence[Episode], task: AnyTask, algorithm: str) -> str:
-    """Write episodes where :func:`~torchrl_l1.experiment.datasets.read_dataset` finds them again.
+    """Write episodes as a dataset for :func:`~torchrl_l1.experiment.datasets.read_dataset`.
 
     Args:
         output: a ``.npz`` file; a name with a version, such as ``hopper/medium-v0``, for a Minari
             dataset, which needs the extra ``minari``; or a folder for a memory-mapped tensordict.
         episodes: at least one.
-        task: what they are of.
-        algorithm: what they were made by, for Minari.
+        task: their task.
+        algorithm: name of the algorithm that made them, for Minari.
 
     Returns:
-        what to give as ``dataset``.
+        the value to give as ``dataset``.
 
     Raises:
-        ValueError: if there is something already, or no Minari for it.
+        ValueError: if the output already exists, or needs Minari, which is not installed.
     """
     path = Path(output)
     check_output(output)
@@ -107,17 +107,17 @@ def write_dataset(output: str, episodes: Sequence[Episode], task: AnyTask, algor
 
 
 def _write_folder(path: Path, data: TensorDictBase) -> None:
-    """Write a memory-mapped tensordict, whole or not at all."""
+    """Write a memory-mapped tensordict completely or not at all."""
     with _beside(path) as temporary:
         try:
             data.memmap(temporary)
-        except RuntimeError as error:  # what torch says of a disk without room
+        except RuntimeError as error:  # what torch raises when the disk is full
             raise ValueError(f"{path} cannot be written: {error}") from error
 
 
 @contextmanager
 def _beside(path: Path) -> Iterator[Path]:
-    """A folder to write to, which is moved to its place once the block has ended well."""
+    """A folder to write to, moved to its place once the block has succeeded."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp")
     try:
@@ -127,7 +127,7 @@ def _beside(path: Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        if error.errno is None:  # of h5py, which has words alone
+        if error.errno is None:  # from h5py, without an error number
             raise OSError(f"{path} cannot be written: {error}") from error
         raise type(error)(error.errno, error.strerror, str(path)) from error
     finally:
@@ -135,34 +135,34 @@ def _beside(path: Path) -> Iterator[Path]:
 
 
 def check_output(output: str) -> None:
-    """Refuse a place for a dataset before it is made.
+    """Refuse an unusable output before the dataset is made.
 
     Raises:
-        ValueError: if there is something already, or no Minari for a name of its kind.
+        ValueError: if it already exists, or needs Minari, which is not installed.
     """
     path = Path(output)
     if path.exists():
-        raise ValueError(f"{output} is there already: choose another place, or remove it")
+        raise ValueError(f"{output} already exists: choose another place, or remove it")
     if path.suffix == ".npz":
         return
     if path.suffix and not is_minari_name(output):
-        raise ValueError(f"{output}: datasets are .npz files, folders, or Minari's (name-v0)")
+        raise ValueError(f"{output}: datasets are .npz files, folders or Minari datasets (name-v0)")
     if is_minari_name(output):
         try:
             import minari
 
-            import_module("h5py")  # what Minari stores its data with
+            import_module("h5py")  # with which Minari stores its data
         except ModuleNotFoundError:
             raise ValueError(
                 f"{output} is the name of a Minari dataset, which needs Minari: pip install "
                 "'torchrl-l1[minari]', or choose a .npz file"
             ) from None
         if output in minari.list_local_datasets():
-            raise ValueError(f"Minari has a dataset {output} already: choose another name")
+            raise ValueError(f"Minari already has a dataset {output}: choose another name")
 
 
 def _rows(episodes: Sequence[Episode]) -> dict[str, np.ndarray]:
-    """One row per sampling instant, the last one of each episode without an action of its own."""
+    """One row per sampling instant; the last one of each episode has no action."""
 
     def column(name: str) -> np.ndarray:
         parts = []
@@ -182,7 +182,7 @@ def _rows(episodes: Sequence[Episode]) -> dict[str, np.ndarray]:
 
 
 def _transitions(episodes: Sequence[Episode]) -> TensorDict:
-    """As TorchRL's collectors give them, one after the other."""
+    """Episodes one after the other, as TorchRL's collectors return them."""
 
     def column(name: str) -> torch.Tensor:
         return torch.from_numpy(np.concatenate([getattr(episode, name) for episode in episodes]))
@@ -231,7 +231,7 @@ def _write_minari(name: str, episodes: Sequence[Episode], task: AnyTask, algorit
         for number, episode in enumerate(episodes)
     ]
     low, high = (bound.numpy() for bound in action_bounds(task))
-    # Minari writes file by file; a kill would leave a part under the name of the whole.
+    # Minari writes file by file; a kill would leave an incomplete dataset under the final name.
     with _beside(get_dataset_path(name)) as temporary, _minari_in(temporary):
         minari.create_dataset_from_buffers(
             name,
@@ -248,7 +248,7 @@ def _write_minari(name: str, episodes: Sequence[Episode], task: AnyTask, algorit
 
 @contextmanager
 def _minari_in(folder: Path) -> Iterator[None]:
-    """Let Minari take a folder for the one of all datasets."""
+    """Make Minari use a folder as the root of all datasets."""
     before = os.environ.get(_MINARI_FOLDER)
     os.environ[_MINARI_FOLDER] = str(folder)
     try:

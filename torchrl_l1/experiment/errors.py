@@ -1,4 +1,4 @@
-"""The errors that are the request's fault: told in one line, without a traceback."""
+"""Errors caused by the request: reported in one line, without a traceback."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class RecipeError(Exception):
 
 
 class RunDirectoryError(Exception):
-    """The run directory cannot be used as asked; the message says why and what to do."""
+    """The run directory cannot be used as requested; the message says why and what to do."""
 
 
 class RunDirectoryInUse(RunDirectoryError):
@@ -26,10 +26,10 @@ class RunDirectoryInUse(RunDirectoryError):
 
 @contextmanager
 def fitting_into_memory(what: str) -> Iterator[None]:
-    """Say in a line what is too large for this machine, as sizes in a file may be.
+    """Report in one line what is too large for this machine, as sizes in a file may be.
 
     Raises:
-        ValueError: if memory cannot be had in the block.
+        ValueError: if memory cannot be allocated in the block.
     """
     try:
         yield
@@ -37,7 +37,7 @@ def fitting_into_memory(what: str) -> Iterator[None]:
         if isinstance(error, RuntimeError) and "allocate memory" not in str(error):
             raise
         raise ValueError(
-            f"{what} does not fit into the memory of this machine; look at the sizes of its "
+            f"{what} does not fit into the memory of this machine; reduce the sizes of its "
             "networks and data (model.hidden, model.members, policy.hidden, horizon, episodes)"
         ) from error
 
@@ -53,7 +53,7 @@ USER_ERRORS = (
     ValueError,
 )
 
-_SPACE = "free some space; nothing is lost, and the same command goes on"
+_SPACE = "free some space; nothing is lost, and the same command continues"
 _REMEDIES = {
     errno.ENOSPC: _SPACE,
     errno.EDQUOT: _SPACE,
@@ -67,21 +67,21 @@ _REMEDIES = {
     errno.ENOTEMPTY: "something is in the way; move it away",
     errno.ELOOP: "a symbolic link is in the way; remove it",
     errno.EMFILE: "too many files are open; raise the limit (ulimit -n)",
-    errno.EFBIG: "raise the limit on the size of files (ulimit -f), and the same command goes on",
-    errno.EIO: "the disk fails; choose another place",
+    errno.EFBIG: "raise the limit on file sizes (ulimit -f), and the same command continues",
+    errno.EIO: "the disk is failing; choose another place",
 }
 _LONGEST = 2000
 
 
 def message(error: BaseException) -> str:
-    """The error's own words in one line, with the remedy where the system has refused something."""
+    """The error's own message in one line, with a remedy if the system has refused something."""
     if isinstance(error, BrokenPipeError):
-        return "what reads the output has ended"
+        return "the reader of the output has exited"
     if isinstance(error, OSError) and error.errno is not None:
         remedy = _REMEDIES.get(error.errno)
         where = f"{error.filename}: " if error.filename else ""
         return where + (error.strerror or str(error)) + (f"; {remedy}" if remedy else "")
-    # ``KeyError`` would quote its words like a key.
+    # ``KeyError`` would quote its message like a key.
     text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
     cause = error.__cause__
     if isinstance(error, OverrideParseException):
@@ -95,7 +95,7 @@ def message(error: BaseException) -> str:
 
 
 def typed_override(key: str, value: str) -> str:
-    """An override as a shell takes it, whatever characters the value has.
+    """An override as typed in a shell, whatever characters the value has.
 
     Examples:
         >>> print(typed_override("run_dir", "runs/l1=off"))
@@ -106,24 +106,24 @@ def typed_override(key: str, value: str) -> str:
 
 
 def _of_override(text: str, override: str) -> str:
-    """Hydra's words with the override that they are of, and without a link to its grammar."""
+    """Hydra's message with the override that it refers to, without the link to its grammar."""
     if "=" not in override:
-        return f"{override!r} is no override: write KEY=VALUE, such as seed=3"
+        return f"{override!r} is not an override: write KEY=VALUE, such as seed=3"
     text = re.split(r"\s*See https://hydra", text)[0]
     where = "" if override in text else f"{override}: "
     key, _, value = override.partition("=")
-    # The directories of runs are named by overrides, so that "=" is in many a path.
+    # Run directories are named after overrides, so paths often contain "=".
     word = typed_override(key, value)
-    remedy = f"; a value of such characters has quotes of its own: {word}" if value else ""
+    remedy = f"; quote a value with such characters: {word}" if value else ""
     return f"{where}{text}{remedy}"
 
 
 def _of_hydra(text: str, cause: str) -> str:
-    """Hydra's words without its advice to add keys that no schema knows, and without its path."""
+    """Hydra's message without its search path and its advice to add keys that no schema knows."""
     unknown = re.search(r"Key '(\w+)' (?:is )?not in (?:struct|'\w+')", f"{text}\n{cause}")
     place = re.search(r"full_key: (\S+)", f"{text}\n{cause}")
     if unknown:
-        return f"there is no key {(place or unknown)[1]!r}; --cfg job shows those that there are"
+        return f"there is no key {(place or unknown)[1]!r}; --cfg job shows the existing ones"
     text = re.split(r"\n\s*Config search path:", text)[0]
     cause = re.split(r"\n\s*full_key:", cause)[0]
     lines = [line.strip() for line in text.splitlines()]

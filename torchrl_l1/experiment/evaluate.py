@@ -58,8 +58,8 @@ class TrainedRun:
     Attributes:
         path: the run directory.
         recipe: its settings.
-        algorithm: with the state of a checkpoint.
-        checkpoint: name of a kept one; empty for the last.
+        algorithm: the algorithm with the state of a checkpoint.
+        checkpoint: name of a kept checkpoint; empty for the last.
     """
 
     path: Path
@@ -69,23 +69,21 @@ class TrainedRun:
 
     @property
     def name(self) -> str:
-        """As users name it: the run directory, or the file of the kept checkpoint."""
+        """The run as users name it: its directory, or the file of the kept checkpoint."""
         return str(self.path / KEPT / f"{self.checkpoint}.pt" if self.checkpoint else self.path)
 
     def stage(self, name: str | None) -> str:
         """The name of a stage that the run has reached; of the last one if ``None``.
 
         Raises:
-            ValueError: if there is no such stage, or not yet, with the run and those it has.
+            ValueError: if there is no such stage (yet), naming the run and its stages.
         """
         reached = list(self.algorithm.policies)
         if name is None:
             return reached[-1]
         if name not in reached:
             there = "there are" if len(reached) > 1 else "there is"
-            raise ValueError(
-                f"{self.path}: no stage {name!r}, or not yet; {there} {', '.join(reached)}"
-            )
+            raise ValueError(f"{self.path}: no stage {name!r} so far; {there} {', '.join(reached)}")
         return name
 
 
@@ -93,12 +91,12 @@ def load_run(path: str | Path, *, last: bool = False) -> TrainedRun:
     """Load recipe, model and policy of a run directory.
 
     Args:
-        path: the directory, or one of the checkpoints that it keeps, such as
+        path: the directory, or one of its kept checkpoints, such as
             ``RUN_DIR/checkpoints/best.pt``.
-        last: whether the checkpoint before the last one will not do where that cannot be read.
+        last: whether to insist on the last checkpoint, even if only the one before it is readable.
 
     Raises:
-        RunDirectoryError: if the directory holds no run, or no checkpoint that can be read.
+        RunDirectoryError: if the directory holds no run or no readable checkpoint.
     """
     kept = kept_by(Path(path))
     directory = RunDirectory(path if kept is None else kept)
@@ -109,7 +107,7 @@ def load_run(path: str | Path, *, last: bool = False) -> TrainedRun:
     checkpoint = directory.load_checkpoint() if kept is None else directory.load_kept(Path(path))
     if checkpoint is not None and last and not directory.last_is_good:
         raise RunDirectoryError(
-            f"{directory.checkpoint_file} cannot be read; resume the run, which makes it again"
+            f"{directory.checkpoint_file} cannot be read; resume the run, which rewrites it"
         )
     if checkpoint is None:
         raise RunDirectoryError(f"the run in {path} has no checkpoint yet; let it finish first")
@@ -131,13 +129,13 @@ def _recipe(directory: RunDirectory) -> RunSettings:
         recipe = OmegaConf.to_object(OmegaConf.merge(schema, _literal(stored)))
         assert isinstance(recipe, RunSettings)
         return recipe
-    # Whatever stands in a damaged file: OmegaConf and dataclasses have no common error.
+    # A damaged file may hold anything: errors of OmegaConf and dataclasses have no common class.
     except Exception as error:
         raise RunDirectoryError(f"cannot use {directory.config_file}: {message(error)}") from error
 
 
 def _literal(value: Any) -> Any:
-    """Settings as OmegaConf leaves them as they are: interpolations were resolved for the run."""
+    """Settings escaped for OmegaConf: interpolations were resolved for the run."""
     if isinstance(value, dict):
         return {key: _literal(inner) for key, inner in value.items()}
     if isinstance(value, list):
@@ -148,7 +146,7 @@ def _literal(value: Any) -> Any:
 
 
 def _measure_residuals(algorithm: Algorithm, buffer: dict[str, Any]) -> None:
-    """From the run's own data, what training without a Kalman filter has not measured."""
+    """Calibrate, on the run's own data, what training without a Kalman filter has not measured."""
     dynamics, task = algorithm.acting_dynamics, algorithm.task
     if not buffer:
         return
@@ -165,14 +163,14 @@ def _measure_residuals(algorithm: Algorithm, buffer: dict[str, Any]) -> None:
 
 
 def distinct(trained: TrainedRun, cells: Sequence[Condition]) -> list[Condition]:
-    """Those conditions that differ for a run, with the names of their stages.
+    """The conditions that are distinct for a run, with the names of their stages.
 
-    Sampled and mean actions of a planner are the same, and so is a controller whose operating
-    point follows the executed input, whatever its ``epsilon``: of conditions that differ in nothing
-    else the first stays.
+    Sampled and mean actions of a planner are the same, and ``epsilon`` makes no difference to a
+    controller whose operating point follows the executed input. Of conditions that differ in
+    nothing else, only the first is kept.
 
     Raises:
-        ValueError: for a stage that the run has not.
+        ValueError: for a stage that the run does not have.
     """
     found: dict[Condition, Condition] = {}
     for cell in cells:
@@ -194,13 +192,13 @@ def evaluate(
     """Returns of a frozen policy, one row per condition.
 
     Every condition sees the same resets and the same random numbers. Model and policy are
-    those of the run's last checkpoint. ``own_l1`` is 1 where the controller is the one that the
-    run was trained with, else 0; ``epsilon`` and ``alpha`` hold what the condition sets, and
-    ``steps_mean`` is the mean length of the episodes. Where an algorithm has several stages,
+    those of the run's last checkpoint. ``own_l1`` is 1 if the controller is the one that the
+    run was trained with, else 0; ``epsilon`` and ``alpha`` are those set by the condition, and
+    ``steps_mean`` is the mean length of the episodes. If an algorithm has several stages,
     ``stage`` names the tested one.
 
     Raises:
-        ValueError: for a stage that the run has not, before anything is evaluated.
+        ValueError: for a stage that the run does not have, before anything is evaluated.
     """
     for row, _ in evaluate_episodes(trained, cells, episodes, seed):
         yield row
@@ -212,14 +210,15 @@ def evaluate_episodes(
     episodes: int,
     seed: int = 0,
 ) -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
-    """As :func:`evaluate`, each row with those of its single episodes.
+    """As :func:`evaluate`, with the rows of the single episodes beside each row.
 
     Their columns are those of the condition, the run, and ``episode``, ``return`` and ``steps``,
-    the length of the episode. Episodes of one number start from the same reset in all conditions.
+    the length of the episode. Episodes of the same number start from the same reset in all
+    conditions.
 
     Raises:
-        ValueError: for a stage that the run has not, or values that a controller has not, before
-            anything is evaluated.
+        ValueError: for a stage that the run does not have, or values that a controller does not
+            take, before anything is evaluated.
     """
     check_plants(trained.algorithm.task, cells)
     check_controllers(trained.recipe.l1, trained.algorithm.task, cells)
@@ -250,7 +249,7 @@ def evaluate_episodes(
 
 
 def check_plants(task: AnyTask, cells: Sequence[Condition]) -> None:
-    """Refuse changes of a plant that cannot be reached.
+    """Refuse changes to a plant that cannot be modified.
 
     Raises:
         ValueError: naming disturbance and environment.
@@ -263,12 +262,12 @@ def check_plants(task: AnyTask, cells: Sequence[Condition]) -> None:
 
 
 def check_controllers(own: L1Settings, task: AnyTask, cells: Sequence[Condition]) -> None:
-    """Refuse values that a controller does not have, as ``alpha`` where a filter needs none.
+    """Refuse values that a controller does not take, such as ``alpha`` for a filter without it.
 
     Args:
         own: the controller of the run.
         task: its task.
-        cells: what it is to be tested in.
+        cells: the conditions to test.
 
     Raises:
         ValueError: naming the controller.
@@ -281,7 +280,7 @@ def check_controllers(own: L1Settings, task: AnyTask, cells: Sequence[Condition]
 
 
 def reachable(trained: TrainedRun, cells: Sequence[Condition]) -> list[Condition]:
-    """Those conditions of a suite that can act on the task of a run."""
+    """The conditions of a suite that can act on the task of a run."""
     task = trained.algorithm.task
     if isinstance(task, Task):
         source = environment_source(task)
@@ -294,16 +293,16 @@ def reachable(trained: TrainedRun, cells: Sequence[Condition]) -> list[Condition
 
 
 def episodes_file(table: Path) -> Path:
-    """Where the rows of single episodes are that belong to a table in ``RUN_DIR/evaluations``."""
+    """The file with the single episodes of a table in ``RUN_DIR/evaluations``."""
     return table.parent / "episodes" / table.name
 
 
 def table_checksums(table: Path) -> dict[str, str]:
-    """Digests of a table in ``RUN_DIR/evaluations`` and of its episodes, as far as they are there.
+    """Digests of a table in ``RUN_DIR/evaluations`` and of its episodes, if they exist.
 
     Raises:
         OSError: if one cannot be read.
-        ValueError: if one is no text.
+        ValueError: if one is not text.
     """
     files = {"table": table, "episodes": episodes_file(table)}
     return {name: digest(read_text(file)) for name, file in files.items() if file.exists()}
@@ -329,12 +328,12 @@ def make_collection(trained: TrainedRun, cell: Condition, episodes: int) -> Coll
 def _columns(trained: TrainedRun, cell: Condition) -> dict[str, Any]:
     columns = cell.columns()
     if not trained.algorithm.facts.named_stages:
-        del columns["stage"]  # there is no choice, and nothing to say
+        del columns["stage"]  # there is no choice, and so nothing to name
     return columns
 
 
 def _is_own(trained: TrainedRun, cell: Condition) -> bool:
-    """Whether the controller of a test is the one that the run was trained with."""
+    """Whether a test's controller is the one that the run was trained with."""
     if cell.l1 == ORACLE:
         return False
     own, task = trained.recipe.l1, trained.algorithm.task
@@ -352,9 +351,8 @@ def _follows(trained: TrainedRun, cell: Condition) -> bool:
 def _tested_l1(own: L1Settings, task: AnyTask, cell: Condition) -> L1Settings:
     """The controller of a test.
 
-    Where the option is the one that the run was trained with, however it was tuned, it is the
-    run's own. Any other is as shipped, with the run's epsilon if it has one. What the condition
-    sets counts for either.
+    For the option that the run was trained with, however tuned, it is the run's own. Any other is
+    as shipped, with the run's epsilon if it has one. The values of the condition override either.
     """
     if cell.l1 == closest_option(own, task):
         settings = own

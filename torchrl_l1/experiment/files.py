@@ -1,4 +1,4 @@
-"""Files: replaced in one step, locked, named within bounds, and never through somebody's link."""
+"""Files: replaced atomically, locked, with names of bounded length, never written through links."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from torchrl_l1.atomic import NO_FOLLOW, keep_file, write_atomically
 from torchrl_l1.experiment.errors import RunDirectoryError
 
 LONGEST_NAME = 120
-"""Characters of a name that is made from settings; file systems take 255 bytes, some 143."""
+"""Longest name made from settings, in characters; file systems take 255 bytes, some 143."""
 
-# File systems take these, so the directories of older runs are found again.
+# File systems allow names of this length, so that directories of older runs keep theirs.
 _LONGEST_OVERRIDES = 230
 _DIGEST = 10
 
-# A recipe has a few hundred entries; what aliases make of a small file may not fit into memory.
+# A recipe has a few hundred entries; aliases may expand a small file beyond memory.
 _MOST_YAML_BYTES, _MOST_YAML_ENTRIES = 500_000, 50_000
 
 
@@ -39,7 +39,7 @@ def digest(text: str | bytes, length: int = 16) -> str:
 
 
 def bounded(name: str, longest: int = LONGEST_NAME) -> str:
-    """A name that a file system takes: one that is too long is cut and ends in its digest.
+    """A name that file systems accept: one that is too long is cut and ends in its digest.
 
     Examples:
         >>> bounded("by_label_half_cheetah")
@@ -54,7 +54,7 @@ def bounded(name: str, longest: int = LONGEST_NAME) -> str:
 
 
 def path_text(text: str) -> str:
-    """A text as a part of a path: what separates folders becomes an underscore.
+    """A text as one part of a path: separators of folders become underscores.
 
     Examples:
         >>> path_text("task=gymnasium/Reacher-v5")
@@ -64,9 +64,9 @@ def path_text(text: str) -> str:
 
 
 def bounded_overrides(dirname: str) -> str:
-    """Hydra's name for a list of overrides, with the shortest of them and a digest if it is long.
+    """Hydra's name for a list of overrides; if too long, its shortest ones and a digest.
 
-    A path among them leads down only: ``..`` would take away what stands before it in the name.
+    Paths in it only lead down: ``..`` would remove what precedes it in the name.
 
     Examples:
         >>> bounded_overrides("l1=off,noise=action")
@@ -96,7 +96,7 @@ def refuse_link(path: Path) -> None:
     """Make sure that a file or folder of a run directory is not a symbolic link.
 
     Raises:
-        RunDirectoryError: if it is one: what would be written or deleted lies elsewhere.
+        RunDirectoryError: if it is one: files elsewhere would be written or deleted.
     """
     if path.is_symlink():
         raise RunDirectoryError(
@@ -105,7 +105,7 @@ def refuse_link(path: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder, and find out before hours of work whether results can be written to it.
+    """Make a folder and check, before hours of work, that results can be written to it.
 
     Raises:
         OSError: with the name of the folder.
@@ -120,10 +120,10 @@ def make_folder(folder: Path) -> None:
 
 
 def make_place(file: Path) -> None:
-    """Make the folder of a file that work will end with, and find out whether it can be written.
+    """Make the folder of a file to be written at the end, and check that it can be written.
 
     Raises:
-        OSError: with the name of what is in the way.
+        OSError: with the name of the obstacle.
     """
     if file.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(file))
@@ -132,20 +132,20 @@ def make_place(file: Path) -> None:
 
 @contextmanager
 def locked(file: Path, mode: str = "a") -> Iterator[bool]:
-    """Lock a file for as long as the block lasts, or say that another process has.
+    """Lock a file for the duration of the block, unless another process has locked it.
 
-    The lock is this process's, not its children's, and the system frees it when the process ends,
-    however it does.
+    The lock belongs to this process, not to its children, and the system releases it when the
+    process ends, in whatever way.
 
     Args:
-        file: the file; what is in it does not matter.
-        mode: how it is opened; by default it is made where there is none.
+        file: the file; its contents do not matter.
+        mode: the mode in which it is opened; by default it is created if missing.
 
     Yields:
-        whether the lock is ours.
+        whether this process holds the lock.
 
     Raises:
-        RunDirectoryError: if the file is a link, or something that is no file.
+        RunDirectoryError: if the file is a link or not a regular file.
     """
     refuse_link(file)
     if file.exists() and not file.is_file():
@@ -179,7 +179,7 @@ def write_table(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def copy_in_place(file: Path, at: Path) -> None:
-    """Make a copy of a file that is replaced as a whole and never changed; it takes no room.
+    """Copy a file that is only ever replaced as a whole, by a hard link where possible.
 
     Raises:
         RunDirectoryError: if the copy's folder is a link.
@@ -196,50 +196,50 @@ def copy_in_place(file: Path, at: Path) -> None:
 
 
 def saved(state: object) -> bytes:
-    """What ``torch.save`` writes of something."""
+    """The bytes that ``torch.save`` writes for an object."""
     buffer = io.BytesIO()
     torch.save(state, buffer)
     return buffer.getvalue()
 
 
 def read_text(file: Path, most_bytes: int | None = None) -> str:
-    """The text of a regular file: a pipe in its place would be waited for for ever.
+    """The text of a regular file: reading a pipe in its place would block forever.
 
     Raises:
-        ValueError: if it is no regular file, too long, or no UTF-8.
+        ValueError: if it is not a regular file, is too long, or is not UTF-8.
         OSError: if it cannot be read.
     """
     if not file.is_file():
         if not file.exists():
             raise FileNotFoundError(2, "No such file or directory", str(file))
-        raise ValueError(f"{file} is no file")
+        raise ValueError(f"{file} is not a regular file")
     if most_bytes is not None and file.stat().st_size > most_bytes:
         raise ValueError(f"{file} is longer than {most_bytes} bytes")
     return file.read_text(encoding="utf-8")
 
 
 def yaml_text(file: Path) -> str:
-    """The text of a YAML file that is small, whatever its aliases make of it.
+    """The text of a YAML file that is small even after its aliases are expanded.
 
     Raises:
-        ValueError: if it is not, or no YAML.
+        ValueError: if it is not small or not YAML.
         OSError: if it cannot be read.
     """
     text = read_text(file, _MOST_YAML_BYTES)
     if "*" in text and "&" in text:
         try:
             if _entries(yaml.compose(text, yaml.SafeLoader), {}) > _MOST_YAML_ENTRIES:
-                raise ValueError(f"{file} has aliases that make it too large")
+                raise ValueError(f"{file} has aliases that expand it too far; remove them")
         except (yaml.YAMLError, RecursionError) as error:
             raise ValueError(f"{file} is not valid YAML: {problem(error)}") from error
     return text
 
 
 class _PlainLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Reads numbers and words as OmegaConf does, where libyaml is there in a tenth of the time."""
+    """Reads numbers and words as OmegaConf does; with libyaml, in a tenth of the time."""
 
 
-# YAML 1.1 takes 1e-3 for a word, and dates for dates.
+# YAML 1.1 would read 1e-3 as a string, and dates as dates.
 _PlainLoader.yaml_implicit_resolvers = {
     letter: [entry for entry in entries if not entry[0].endswith(":timestamp")]
     for letter, entries in yaml.SafeLoader.yaml_implicit_resolvers.items()
@@ -249,20 +249,20 @@ _PlainLoader.add_implicit_resolver(
     re.compile(r"[-+]?\d+(_\d+)*(\.[\d_]*)?[eE][-+]?\d+$|\.\d+(_\d+)*([eE][-+]\d+)?$", re.ASCII),
     list("-+0123456789."),
 )
-# References, tags and interpolations are OmegaConf's to judge; libyaml's nesting has no bounds.
+# OmegaConf judges references, tags and interpolations; libyaml does not limit nesting.
 _NOT_PLAIN = re.compile(r"[&*!\r\x85\u2028\u2029]|\$\{|^[ \t?:-]{60}|^---|^\.\.\.|^%", re.MULTILINE)
 _MOST_BRACKETS = 200
 
 
 def settings_content(file: Path) -> Any:
-    """The content of a YAML file of settings, interpolations as they are written.
+    """The content of a YAML file of settings, with unresolved interpolations.
 
     Raises:
-        Exception: of many kinds, if it cannot be read or is nothing that OmegaConf would take.
+        Exception: of many kinds, if it cannot be read or OmegaConf would not accept it.
     """
     text = yaml_text(file)
     if not _NOT_PLAIN.search(text) and text.count("[") + text.count("{") < _MOST_BRACKETS:
-        # What is wrong is told by the one that says it best.
+        # Let the one with the best message report what is wrong.
         with suppress(yaml.YAMLError, ValueError):
             node = yaml.compose(text, _PlainLoader)
             if _is_plain(node):
@@ -271,7 +271,7 @@ def settings_content(file: Path) -> Any:
 
 
 def _is_plain(node: Any) -> bool:
-    """Whether all keys in a mapping, and in those below it, are words, each once."""
+    """Whether all keys in a mapping and in those nested in it are strings without duplicates."""
     if isinstance(node, yaml.SequenceNode):
         return all(isinstance(one, yaml.ScalarNode) or _is_plain(one) for one in node.value)
     if not isinstance(node, yaml.MappingNode):
@@ -292,9 +292,11 @@ def problem(error: BaseException) -> str:
 
 
 def _entries(node: Any, known: dict[int, int]) -> int:
-    """Nodes below one, each as often as it is named."""
+    """Number of nodes below one, counting each as often as it is referenced."""
     if id(node) not in known:
-        known[id(node)] = _MOST_YAML_ENTRIES + 1  # while it is counted: it is part of itself
+        known[id(node)] = (
+            _MOST_YAML_ENTRIES + 1
+        )  # met again while being counted: it contains itself
         parts: list[Any] = []
         if isinstance(node, yaml.SequenceNode):
             parts = node.value

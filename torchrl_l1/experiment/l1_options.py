@@ -1,4 +1,4 @@
-"""The shipped options of the L1 controller, and which of them a run's own stands for."""
+"""The shipped options of the L1 controller, and which of them a run's controller corresponds to."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ OFF = "off"
 """The option without L1."""
 
 UNTUNED = (OFF, ORACLE)
-"""What a test may name in place of a controller that epsilon and alpha could tune."""
+"""Names in tests that stand for no controller that epsilon and alpha could tune."""
 
-# What runs are tuned by; it makes no other controller.
+# Settings by which runs are tuned; they do not make a different controller.
 _NO_OPTION = ("enabled", "epsilon", "compile")
-# Two ways to give one number.
+# Two ways to give the same number.
 _FILTER = ("alpha", "cutoff")
 
 
 @cache
 def l1_options() -> dict[str, L1Settings]:
-    """The options of the recipe group ``l1`` by name, ``off`` included.
+    """The options of the recipe group ``l1`` by name, including ``off``.
 
     Examples:
         >>> l1_options()["slow"].alpha
@@ -42,13 +42,13 @@ def l1_option(name: str) -> L1Settings:
     """A shipped option of the recipe group ``l1``.
 
     Raises:
-        ValueError: if it does not exist; the message lists those that do.
+        ValueError: for an unknown option; the message lists the known ones.
     """
     return L1Settings(**group_setting("l1", name))
 
 
 def is_tuned(name: str) -> bool:
-    """Whether epsilon and alpha say something to what a test names.
+    """Whether epsilon and alpha apply to what a test names.
 
     Examples:
         >>> is_tuned("paper"), is_tuned("robust"), is_tuned("oracle")
@@ -58,13 +58,13 @@ def is_tuned(name: str) -> bool:
 
 
 def check_tested(names: Iterable[str]) -> None:
-    """Refuse what frozen policies cannot be tested with.
+    """Refuse controllers that frozen policies cannot be tested with.
 
     Args:
         names: options of the recipe group ``l1``, or the oracle, which trains no run.
 
     Raises:
-        ValueError: for any other name; the message lists those that there are.
+        ValueError: for any other name; the message lists the known ones.
     """
     there = [*group_options("l1"), ORACLE]
     for name in names:
@@ -75,8 +75,8 @@ def check_tested(names: Iterable[str]) -> None:
 def filter_gain(settings: L1Settings, task: str | AnyTask) -> float:
     """Gain per step of the low-pass filter, however it was given.
 
-    Of an environment of elsewhere that is only named, it is the cutoff in rad/s where that was
-    given: nothing is run to learn the time of a step.
+    For an external environment given only by name, it is the cutoff in rad/s if that was given:
+    nothing is run to find out the time step.
 
     Raises:
         KeyError: for an unknown task, whose time step a ``cutoff`` needs.
@@ -93,14 +93,14 @@ def filter_gain(settings: L1Settings, task: str | AnyTask) -> float:
         return DEFAULT_ALPHA if gain is None else gain
     config = l1_config(replace(settings, enabled=True), task)
     assert config is not None
-    # The product of cutoff and time step differs from a written alpha in its last digit.
+    # The product of cutoff and time step may differ from a written alpha in the last digit.
     return float(f"{config.filter_gain:.9g}")
 
 
 def departures(settings: L1Settings, option: str, task: str | AnyTask) -> dict[str, Any]:
-    """In what a controller departs from a shipped option, with its values.
+    """The settings in which a controller departs from a shipped option, with its values.
 
-    Epsilon and compilation do not count, and the filter counts by its gain, as ``alpha``.
+    Epsilon and compilation do not count; the filter is compared by its gain, as ``alpha``.
 
     Examples:
         >>> departures(L1Settings(enabled=True, cutoff=2.5), "paper", "inverted_pendulum")
@@ -117,12 +117,12 @@ def departures(settings: L1Settings, option: str, task: str | AnyTask) -> dict[s
 
 
 def closest_option(settings: L1Settings, task: str | AnyTask, *, by_filter: bool = True) -> str:
-    """The shipped option that a controller departs least from.
+    """The shipped option from which a controller departs least.
 
     Args:
-        settings: the controller's.
+        settings: the controller's settings.
         task: name of the task.
-        by_filter: whether the filter's gain tells options apart that are equal otherwise.
+        by_filter: whether the filter's gain distinguishes options that are otherwise equal.
 
     Examples:
         >>> slow = L1Settings(enabled=True, alpha=0.1)
@@ -137,7 +137,7 @@ def closest_option(settings: L1Settings, task: str | AnyTask, *, by_filter: bool
     def distance(option: str) -> tuple[int, bool, bool]:
         found = departures(settings, option, task)
         filters = found.pop("alpha", None) is not None
-        # The first of equals: the paper's controller is what a user's own departs from.
+        # The first of equals: users' own controllers depart from the paper's.
         return len(found), by_filter and filters, option != "paper"
 
     return min((name for name, values in l1_options().items() if values.enabled), key=distance)
@@ -165,7 +165,7 @@ def same_controller(one: L1Settings, other: L1Settings, task: str | AnyTask) -> 
 
 
 def controller_label(option: str, **values: float | None) -> str:
-    """An option and what a test has set of it, as tables and figures name a controller.
+    """An option and the values that a test sets, as tables and figures name a controller.
 
     Examples:
         >>> controller_label("paper", epsilon=0.3, alpha=0.1), controller_label("off", alpha=None)
@@ -178,10 +178,10 @@ def check_tuning(epsilon: Sequence[float], alpha: Sequence[float], prefix: str =
     """Refuse values that no controller can be tested with.
 
     Args:
-        epsilon: tolerances of the switching law; with 0 the affine model sits at the policy's
-            action in every step.
+        epsilon: tolerances of the switching law; with 0 the affine model is at the policy's action
+            in every step.
         alpha: gains of the filter per step.
-        prefix: what stands before the name of an option where the user writes it.
+        prefix: prefix of option names as the user writes them.
 
     Raises:
         ValueError: naming the option and the value.

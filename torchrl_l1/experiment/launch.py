@@ -40,14 +40,14 @@ from torchrl_l1.experiment.settings import (
     register,
 )
 
-# What does not tell results apart, or is named in another way.
+# Settings that do not distinguish results, or that appear in names in another way.
 _IN_NO_NAME = (
     *("seed", "run_dir", "resume", "recipe", "loggers", "checkpoint.every", "checkpoint.best"),
     "search_path",
     *(f"wandb.{part.name}" for part in fields(WandbSettings)),
 )
 
-# The run directory is ours to open, so Hydra must not create or write to it first.
+# The run opens its directory itself, so Hydra must not create or write to it first.
 _HYDRA_SETTINGS = [
     "hydra.output_subdir=null",
     "hydra.run.dir=.",
@@ -55,7 +55,7 @@ _HYDRA_SETTINGS = [
     "hydra.sweep.subdir=.",
     "hydra/job_logging=disabled",
     "hydra/hydra_logging=disabled",
-    # The project stays where it was: directories of older runs are found again.
+    # The project stays in the name, so that directories of older runs are found again.
     "hydra.job.config.override_dirname.exclude_keys="
     f"[{','.join(key for key in _IN_NO_NAME if key != 'wandb.project')}]",
 ]
@@ -66,13 +66,13 @@ _FLAGS_WITH_VALUE = (
 )
 
 
-# With these the configuration is put together in ways of the user's own.
+# With these, users compose the configuration in their own way.
 _OWN_WAYS = (
     *("--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp", "--help", "-h"),
     *("--experimental-rerun", "--hydra-help", "--shell-completion", "-sc"),
 )
 
-# What Hydra writes of itself: of which recipe it is, and what was overridden.
+# What Hydra itself sets: the name of the recipe and the overrides.
 _HYDRAS_OWN = ("job.config_name", "job.name", "job.override_dirname", "overrides", "runtime")
 
 _SCHEMA_NAMES = {f"{name}_recipe": name for name in SCHEMAS}
@@ -81,7 +81,7 @@ _SCHEMA_NAMES = {f"{name}_recipe": name for name in SCHEMAS}
 def launch(name: str, arguments: Sequence[str]) -> None:
     """Run a recipe as a Hydra application with overrides and Hydra's own flags, in any order.
 
-    The flag ``--trust`` lets a recipe of the user's set up Hydra itself, see :func:`check_data`.
+    The flag ``--trust`` lets a user's recipe configure Hydra itself, see :func:`check_data`.
 
     Raises:
         RecipeError: if there is no such recipe, it does not compose, or nothing would run.
@@ -107,7 +107,7 @@ def launch(name: str, arguments: Sequence[str]) -> None:
 
 
 class _WithoutOverrides:
-    """Standard error without what Hydra adds to the line of an error: all overrides, and advice."""
+    """Standard error without the overrides and advice that Hydra adds to an error message."""
 
     _LEFT_OUT = ("Error executing job with overrides", "\nSet the environment variable HYDRA_FULL")
 
@@ -122,7 +122,7 @@ class _WithoutOverrides:
 
 
 def _check(recipe: Path, overrides: Sequence[str], sweeps: bool, trusted: bool) -> DictConfig:
-    """Compose the first run, and refuse what Hydra would tell at length, or not at all."""
+    """Compose the first run, and refuse what Hydra would report at length, or not at all."""
     if not trusted:
         check_data(recipe)
     settings = [*_search_path(recipe), *_HYDRA_SETTINGS]
@@ -140,7 +140,7 @@ def _check(recipe: Path, overrides: Sequence[str], sweeps: bool, trusted: bool) 
             _check_hydra(recipe, config, bare)
     except HydraException as error:
         with suppress(HydraException), _composing(recipe.parent):
-            # Without a schema no override has a place: that is what is wrong then.
+            # Without a schema, every override fails: report the missing schema instead.
             check_known(_composed(recipe.stem, settings))
         raise RecipeError(message(error)) from error
     except (yaml.YAMLError, RecursionError, OverflowError, TypeError) as error:
@@ -149,8 +149,8 @@ def _check(recipe: Path, overrides: Sequence[str], sweeps: bool, trusted: bool) 
     for text in overrides:
         if "interval(" in text and config.hydra.sweeper._target_.endswith(".BasicSweeper"):
             raise RecipeError(
-                f"{text}: only a sweeper such as hydra/sweeper=optuna chooses from an interval; "
-                "name values, or give that sweeper"
+                f"{text}: an interval needs a sweeper such as hydra/sweeper=optuna; give values, "
+                "or that sweeper"
             )
     return config
 
@@ -165,12 +165,12 @@ def _composed(name: str | None, overrides: list[str]) -> DictConfig:
     application = GlobalHydra.instance().hydra
     assert application is not None
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Hydra says it again when it runs
+        warnings.simplefilter("ignore")  # Hydra repeats it when it runs
         return application.compose_config(name, overrides, run_mode=RunMode.RUN, from_shell=False)
 
 
 def _spelled_out(recipe: Path, overrides: Sequence[str]) -> list[str]:
-    """Overrides with the options that a glob matches: Hydra knows those beside the recipe only."""
+    """Overrides with globs expanded: Hydra itself only knows options beside the recipe."""
     folders = _group_folders(recipe)
     found = []
     for text in overrides:
@@ -196,7 +196,7 @@ def _first(overrides: Sequence[str]) -> list[str]:
     for text, override in zip(overrides, parser.parse_overrides(list(overrides)), strict=True):
         if override.is_sweep_override():
             interval = override.value()
-            # A sweeper chooses from an interval; what lies at its start will do here.
+            # A sweeper chooses from an interval; its start will do here.
             if isinstance(interval, IntervalSweep):
                 values = [str(interval.start)]
             else:
@@ -209,13 +209,13 @@ def _first(overrides: Sequence[str]) -> list[str]:
 
 
 def check_data(recipe: Path) -> None:
-    """Make sure that a recipe is data: it may not set up Hydra, which would run code for it.
+    """Make sure that a recipe is data: it may not configure Hydra, which could run code.
 
     Args:
         recipe: a YAML file.
 
     Raises:
-        RecipeError: if it is no YAML, or has a section ``hydra``.
+        RecipeError: if it is not YAML or has a section ``hydra``.
     """
     try:
         content = yaml.load(yaml_text(recipe), yaml.BaseLoader)
@@ -224,7 +224,7 @@ def check_data(recipe: Path) -> None:
     except (OSError, ValueError, TypeError) as error:
         raise RecipeError(f"{recipe} cannot be read: {message(error)}") from error
     if not isinstance(content, dict):
-        raise RecipeError(f"{recipe} holds no keys and values")
+        raise RecipeError(f"{recipe} is not a mapping of keys to values")
     defaults = content.get("defaults")
     named = [str(one) for one in defaults] if isinstance(defaults, list) else []
     if any(str(key).startswith("hydra") for key in content) or any(
@@ -235,11 +235,11 @@ def check_data(recipe: Path) -> None:
 
 
 def _check_defaults(recipe: Path, texts: Any) -> None:
-    """Tell an option that YAML takes for true or false by its name: ``off`` is one of L1's."""
+    """Refuse an option whose name YAML reads as true or false, such as ``off`` of L1."""
     try:
         content = yaml.safe_load(yaml_text(recipe))
     except yaml.YAMLError:
-        return  # Hydra says what is wrong with it
+        return  # Hydra reports what is wrong with it
     entries = content.get("defaults")
     if not (isinstance(entries, list) and isinstance(texts, list)):
         return
@@ -255,7 +255,7 @@ def _check_defaults(recipe: Path, texts: Any) -> None:
 
 
 def _check_hydra(recipe: Path, config: DictConfig, bare: DictConfig) -> None:
-    """Compare Hydra's own settings with those that there are without the recipe."""
+    """Compare Hydra's own settings with those without the recipe."""
     own, other = (flatten(OmegaConf.to_container(part.hydra)) for part in (config, bare))
     for key in sorted(own.keys() | other.keys()):
         known = any(key == name or key.startswith(f"{name}.") for name in _HYDRAS_OWN)
@@ -265,13 +265,13 @@ def _check_hydra(recipe: Path, config: DictConfig, bare: DictConfig) -> None:
 
 def _no_data(recipe: Path, what: str) -> RecipeError:
     return RecipeError(
-        f"{recipe} {what}, by which any code may be run; leave that out, or say --trust if the "
+        f"{recipe} {what}, which may run arbitrary code; leave that out, or give --trust if the "
         "file is yours"
     )
 
 
 def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Hydra's flags, with their values, and the overrides: argparse wants them apart.
+    """Hydra's flags with their values, and the overrides: argparse needs them separated.
 
     Examples:
         >>> split_flags(["seed=0,1", "-m", "l1=off", "--cfg", "job"])
@@ -292,7 +292,7 @@ def compose(name: str, overrides: Sequence[str] = (), *, trusted: bool = False) 
     """The configuration of a recipe, without running it; ``run_dir`` must be overridden to run.
 
     Raises:
-        RecipeError: if there is no such recipe, or it is no data and not ``trusted``.
+        RecipeError: if there is no such recipe, or it is not plain data and not ``trusted``.
 
     Examples:
         >>> compose("metrpo/half_cheetah", ["seed=3", "l1=off"]).l1.enabled
@@ -312,7 +312,7 @@ def compose(name: str, overrides: Sequence[str] = (), *, trusted: bool = False) 
 
 
 def _name(recipe: Path, overrides: Sequence[str]) -> list[str]:
-    """The name of a user's recipe that has none of its own, as an override: that of its file."""
+    """An override that names a user's recipe after its file, if it has no name of its own."""
     if recipe.is_relative_to(recipes_dir()) or any(
         text.startswith("recipe=") for text in overrides
     ):
@@ -320,14 +320,14 @@ def _name(recipe: Path, overrides: Sequence[str]) -> list[str]:
     try:
         content = yaml.load(yaml_text(recipe), yaml.BaseLoader)
     except (yaml.YAMLError, OSError, ValueError, RecursionError):
-        return []  # Hydra says what is wrong with it
+        return []  # Hydra reports what is wrong with it
     named = not isinstance(content, dict) or "recipe" in content
     stem = recipe.stem.replace("'", "\\'")
     return [] if named else [f"recipe='{stem}'"]
 
 
 def _search_path_override(recipe: Path, config: DictConfig, overrides: Sequence[str]) -> list[str]:
-    """The folders of what a recipe names, told to every process that runs a part of it."""
+    """The folders of the code that a recipe names, for every process that runs a part of it."""
     if config.get("search_path"):
         return []
     folders = _folders_of_code(recipe, config, overrides)
@@ -336,7 +336,7 @@ def _search_path_override(recipe: Path, config: DictConfig, overrides: Sequence[
 
 
 def _folders_of_code(recipe: Path, config: DictConfig, overrides: Sequence[str]) -> list[str]:
-    """Folders with modules and files that settings name: that of the recipe, or where we are."""
+    """Folders with modules and files that settings name: the recipe's, or the current one."""
     given = [text.partition("=") for text in overrides]
     names = [name for key, _, value in given if key in NAMING_KEYS for name in value.split(",")]
     values = (OmegaConf.select(config, key) for key in NAMING_KEYS)
@@ -346,13 +346,13 @@ def _folders_of_code(recipe: Path, config: DictConfig, overrides: Sequence[str])
 
 
 def _search_path(recipe: Path) -> list[str]:
-    """Where Hydra looks beside the recipe: with its algorithm, in ``shared``, and from the root."""
+    """Where else Hydra looks: the folder of its algorithm, ``shared``, and the root of recipes."""
     folders = [shared_dir(), *_folders(recipe), recipes_dir()]
     for name, algorithm in _SCHEMA_NAMES.items():
         own = recipe.parent / f"{name}.yaml"
         if recipes_dir() / algorithm in folders and own.is_file():
             raise RecipeError(
-                f"{own} is called like the schema {name}, which recipes beside it would not find; "
+                f"{own} has the name of the schema {name} and hides it from recipes beside it; "
                 "rename the file"
             )
     unique = dict.fromkeys(folder for folder in folders if folder != recipe.parent)
@@ -361,7 +361,7 @@ def _search_path(recipe: Path) -> list[str]:
 
 
 def _check_options(recipe: Path, overrides: Sequence[str]) -> None:
-    """Refuse several options of a group in one run: the last one would count, and none is told."""
+    """Refuse several options of a group in one run: all but the last would be ignored silently."""
     folders = _group_folders(recipe)
     for text in overrides:
         key, _, value = text.lstrip("+").partition("=")
@@ -372,18 +372,18 @@ def _check_options(recipe: Path, overrides: Sequence[str]) -> None:
             and any((folder / key).is_dir() for folder in folders)
         ):
             raise RecipeError(
-                f"{text}: a run has one {key}; -m {key}={several.replace(' ', '')} makes a run of "
-                "each, and so does a campaign's matrix"
+                f"{text}: a run has one {key}; use -m {key}={several.replace(' ', '')} or a "
+                "campaign's matrix for a run of each"
             )
 
 
 def _group_folders(recipe: Path) -> list[Path]:
-    """Where the groups of a recipe are: beside it, shared ones, those of its algorithms."""
+    """Folders with the groups of a recipe: beside it, shared, and those of its algorithms."""
     return [recipe.parent, shared_dir(), *_folders(recipe)]
 
 
 def _folders(recipe: Path) -> list[Path]:
-    """Those with the groups of a recipe: of the algorithms whose schemas it names or includes."""
+    """Folders of the algorithms whose schemas a recipe names or includes."""
     found = []
     for name in _included(recipe):
         if name in _SCHEMA_NAMES:
@@ -395,18 +395,18 @@ def _folders(recipe: Path) -> list[Path]:
 
 
 def _included(recipe: Path) -> list[str]:
-    """What the defaults of a recipe include, as ``pets_recipe`` and ``pets/half_cheetah``."""
+    """Names in the defaults of a recipe, such as ``pets_recipe`` and ``pets/half_cheetah``."""
     try:
         content = OmegaConf.to_container(OmegaConf.load(recipe))
     except (OSError, ValueError, yaml.YAMLError):
-        return []  # Hydra says what is wrong with it
+        return []  # Hydra reports what is wrong with it
     defaults = content.get("defaults") if isinstance(content, dict) else None
     names = [entry for entry in defaults or [] if isinstance(entry, str)]
     return [name.partition("@")[0].removeprefix("/") for name in names]
 
 
 def _task(config: DictConfig) -> float:
-    """Run a composed recipe; what a sweeper that looks for good settings is told of it."""
+    """Run a composed recipe; returns the objective for sweepers that optimise settings."""
     try:
         check_known(config)
         if config.wandb.name is None:
@@ -417,14 +417,14 @@ def _task(config: DictConfig) -> float:
             raise
         line = f"torchrl-l1 run: {message(error)}"
         if HydraConfig.get().mode == RunMode.MULTIRUN:
-            # The others go on; Hydra prints the line in the end and exits with status 1.
+            # The other runs continue; Hydra prints the line at the end and exits with status 1.
             raise CompactHydraException(line) from error
         print(line, file=sys.stderr)
         sys.exit(1)
 
 
 def _shown(config: DictConfig) -> str:
-    """A name for loggers that tells arms apart: the recipe, what differs from it, and the seed."""
+    """A name for loggers that tells arms apart: the recipe, its overrides and the seed."""
     overrides = HydraConfig.get().overrides.task
     differs = [text for text in overrides if text.lstrip("+~").split("=")[0] not in _IN_NO_NAME]
     return bounded(" ".join([config.recipe, *differs, f"seed={config.seed}"]))

@@ -1,7 +1,7 @@
-"""What an evaluation varies: options, keys of campaign files and columns of tables follow from it.
+"""What an evaluation varies: the source of options, keys of campaign files and table columns.
 
-The fields of :class:`Condition` are the one description; :func:`axes` lists them with the
-disturbances of :class:`~torchrl_l1.envs.Perturbation` in their place.
+The fields of :class:`Condition` are the single description; :func:`axes` lists them together with
+the disturbances of :class:`~torchrl_l1.envs.Perturbation`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torchrl_l1.experiment.settings import SCHEMAS
 _STAGES = [stage.name for one in SCHEMAS.values() for stage in one.builds.facts.named_stages]
 
 SUITE_L1 = (OFF, "paper", "robust", ORACLE)
-"""Options of ``l1`` that a suite is tested with where none are given."""
+"""Options of ``l1`` that a suite is tested with by default."""
 
 # Key of the metadata of a field.
 _AXIS = "axis"
@@ -33,12 +33,12 @@ class Axis:
     """One of the things that an evaluation varies.
 
     Attributes:
-        name: of the option, of the key in campaign files, and of the column.
-        kind: of its values, ``str`` or ``float``.
-        values: those that are tested where none are given; empty where the run has its own.
+        name: name of the option, of the key in campaign files, and of the column.
+        kind: type of its values, ``str`` or ``float``.
+        values: values tested by default; empty if the run has its own.
         help: what the values are, in words.
-        choices: the only values that there are; empty if any may be tried.
-        tunes: whether they are values of the controller, whose name then tells them.
+        choices: the only values allowed; empty if any may be tried.
+        tunes: whether they are values of the controller, whose name then includes them.
     """
 
     name: str
@@ -64,22 +64,22 @@ def _axis(
 
 @dataclass(frozen=True)
 class Condition:
-    """One cell: which controller, noise, disturbances and policy, and how this acts.
+    """One cell: controller, noise, disturbances, and the policy and how it acts.
 
     Attributes:
         l1: option of the ``l1`` group, or ``oracle``.
         noise: option of the ``noise`` group.
-        disturbances: value of each of :data:`~torchrl_l1.envs.DISTURBANCES`, by name; those that
-            are not given are neutral.
+        disturbances: value of each of :data:`~torchrl_l1.envs.DISTURBANCES`, by name; neutral if
+            not given.
         policy: ``stochastic`` or ``deterministic``.
-        epsilon: tolerance of the switching law, raw state units; the run's own if ``None``.
+        epsilon: tolerance of the switching law, in raw state units; the run's own if ``None``.
         alpha: gain of the filter per step; that of the option (or of the run's own controller)
             if ``None``.
-        stage: whose policy it is, see :attr:`Algorithm.policies
-            <torchrl_l1.algorithms.algorithm.Algorithm.policies>`; the last one's if ``None``.
+        stage: the stage whose policy is tested, see :attr:`Algorithm.policies
+            <torchrl_l1.algorithms.algorithm.Algorithm.policies>`; the last one if ``None``.
 
     Raises:
-        ValueError: for a disturbance that there is not.
+        ValueError: for an unknown disturbance.
 
     Examples:
         >>> columns = Condition("paper", disturbances={"bias": 0.5}, epsilon=0.3).columns()
@@ -96,7 +96,7 @@ class Condition:
     disturbances: Mapping[str, float] = field(default_factory=dict, hash=False)
     policy: str = _axis(
         str,
-        "sampled or mean actions; both by default, and sampled ones where they are the same",
+        "sampled or mean actions; both by default, or only sampled ones if they are the same",
         KINDS,
         choices=KINDS,
         default=KINDS[0],
@@ -112,9 +112,9 @@ class Condition:
     )
     stage: str | None = _axis(
         str,
-        "stages whose policies are tested, of algorithms with several "
+        "stages whose policies are tested, for algorithms with several "
         f"({', '.join(_STAGES)}); "
-        "the last that there is by default",
+        "the last one by default",
         default=None,
     )
 
@@ -127,22 +127,22 @@ class Condition:
 
     @property
     def controller(self) -> str:
-        """The controller in tables and figures, see :func:`controller_label`."""
+        """Name of the controller in tables and figures, see :func:`controller_label`."""
         return controller_label(self.l1, **self.tuning)
 
     @property
     def tuning(self) -> dict[str, float | None]:
-        """What it sets of the controller, by the names of :data:`TUNING`; else ``None``."""
+        """The controller values that it sets, by the names of :data:`TUNING`; else ``None``."""
         return {name: getattr(self, name) for name in TUNING}
 
     def columns(self) -> dict[str, Any]:
-        """Its values by the names of :func:`axes`, as tables hold them."""
+        """Its values by the names of :func:`axes`, as in tables."""
         every = {**vars(self), **self.disturbances}
         return {axis.name: every[axis.name] for axis in axes()}
 
 
 def axes() -> list[Axis]:
-    """All that an evaluation varies, in the order of the columns of its tables.
+    """Everything that an evaluation varies, in the order of the columns of its tables.
 
     Examples:
         >>> [axis.name for axis in axes() if axis.name not in DISTURBANCES]
@@ -161,24 +161,24 @@ def axes() -> list[Axis]:
 
 
 TUNING = tuple(axis.name for axis in axes() if axis.tunes)
-"""Names of the axes whose values are the controller's, as columns of tables too."""
+"""Names of the axes that tune the controller, in tables too."""
 
 
 def conditions(of_suite: str | None = None, **values: Sequence[Any]) -> list[Condition]:
     """Every combination of controller, noise, stage and policy with each single disturbance.
 
-    Disturbances vary one at a time: the values of the first, then those of each other that are
-    not neutral; or they are those of a suite. Every controller with a low-pass filter is tested
-    with each ``epsilon`` and each ``alpha``; without values, and the others, as they are. Without
-    a ``stage``, the last one's policy is tested.
+    Disturbances vary one at a time, first all values of the first one, then the non-neutral values
+    of each other; or they come from a suite. Every controller with a low-pass filter is tested with
+    each ``epsilon`` and each ``alpha``; other controllers, and all if no values are given, are
+    tested as they are. Without a ``stage``, the last one's policy is tested.
 
     Args:
-        of_suite: name of a suite, whose cells stand in place of the values of disturbances.
-        **values: by the names of :func:`axes`; those of the axis where none are given.
+        of_suite: name of a suite, whose cells replace the values of disturbances.
+        **values: values by the names of :func:`axes`; the axis's defaults where not given.
 
     Raises:
         ValueError: for any other name, for disturbances beside a suite, or for values of alpha
-            where no controller has such a filter.
+            if no controller has a low-pass filter.
 
     Examples:
         >>> cells = conditions(epsilon=[0.3, 1.0], policy=["stochastic"])
@@ -194,7 +194,7 @@ def conditions(of_suite: str | None = None, **values: Sequence[Any]) -> list[Con
     disturbances = _one_at_a_time(given) if of_suite is None else suite(of_suite)
     if given["alpha"] and not any(map(is_tuned, given["l1"])):
         raise ValueError(
-            f"alpha is given, and none of {', '.join(given['l1'])} has a low-pass filter: leave it "
+            f"alpha is given, but none of {', '.join(given['l1'])} has a low-pass filter: leave it "
             "out, or test paper"
         )
     tunings = [
@@ -224,12 +224,12 @@ def _one_at_a_time(given: Mapping[str, Sequence[float]]) -> list[dict[str, float
 
 
 def check_suite(name: str | None, values: Mapping[str, Sequence[Any]], prefix: str = "") -> None:
-    """Refuse a suite that there is not, or one beside values of a disturbance.
+    """Refuse an unknown suite, or one beside values of a disturbance.
 
     Args:
-        name: of the suite; ``None`` is none.
-        values: by the names of :func:`axes`.
-        prefix: what stands before a name where the user writes it.
+        name: name of the suite; ``None`` for none.
+        values: values by the names of :func:`axes`.
+        prefix: prefix of names as the user writes them.
 
     Raises:
         ValueError: naming suite and disturbance.
@@ -241,15 +241,14 @@ def check_suite(name: str | None, values: Mapping[str, Sequence[Any]], prefix: s
     for what, entry in DISTURBANCES.items():
         if any(value != entry.neutral for value in values[what]):
             raise ValueError(
-                f"{prefix}suite and {prefix}{what} both say which disturbances there are; "
-                "leave one of them out"
+                f"{prefix}suite and {prefix}{what} both set disturbances; leave one of them out"
             )
 
 
 def disturbed(columns: Mapping[str, Any]) -> dict[str, float]:
-    """Those disturbances among the columns of a condition that are not neutral, with values.
+    """The disturbances among the columns of a condition that are not neutral, with their values.
 
-    A disturbance that there is no column of is neutral.
+    A disturbance without a column is neutral.
     """
     return {
         name: float(columns[name])
@@ -259,12 +258,12 @@ def disturbed(columns: Mapping[str, Any]) -> dict[str, float]:
 
 
 def undisturbed(columns: Mapping[str, Any]) -> bool:
-    """Whether the columns of a condition hold the neutral value of every disturbance."""
+    """Whether every disturbance in the columns of a condition is neutral."""
     return not disturbed(columns)
 
 
 def disturbance_words(columns: Mapping[str, Any]) -> str:
-    """The disturbances of a condition, as tables and charts name it.
+    """The disturbances of a condition, as tables and charts name them.
 
     Examples:
         >>> disturbance_words({"bias": 0.5, "gain": 1.0}), disturbance_words({})
@@ -278,9 +277,9 @@ def check_disturbance(name: str, value: float, prefix: str = "") -> None:
     """Refuse a value that a disturbance cannot have.
 
     Args:
-        name: of the disturbance.
-        value: what it is to be.
-        prefix: what stands before its name where the user writes it.
+        name: name of the disturbance.
+        value: its value.
+        prefix: prefix of the name as the user writes it.
 
     Raises:
         ValueError: naming disturbance and value.
@@ -294,11 +293,11 @@ def check_disturbance(name: str, value: float, prefix: str = "") -> None:
 
 
 def check_values(values: Mapping[str, Sequence[Any]], prefix: str = "") -> None:
-    """Refuse values that nothing can be tested with.
+    """Refuse values that cannot be tested.
 
     Args:
-        values: by the names of :func:`axes`, of their kinds.
-        prefix: what stands before a name where the user writes it.
+        values: values by the names of :func:`axes`, of their types.
+        prefix: prefix of names as the user writes them.
 
     Raises:
         ValueError: naming axis and value.

@@ -1,4 +1,4 @@
-"""What a run was made with: packages, commit, settings, and the user's own code and data."""
+"""Provenance of a run: packages, commit, settings, and the user's own code and data."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from torchrl_l1.experiment.settings import NAMING_KEYS, VOLATILE_KEYS, flatten, 
 PACKAGES = ("torch", "tensordict", "torchrl", "gymnasium", "mujoco", "numpy")
 
 MAY_GROW = "outer_iterations"
-"""A run that is asked for more of them than it had continues; no other setting may change."""
+"""A run continues if more of them are requested; no other setting may change."""
 
 
 def versions() -> dict[str, str]:
     """Versions of Python, the platform and the packages that a result depends on.
 
-    In a git checkout of this package the commit joins them, see :func:`commit`. They are looked up
-    once in a process, whose code stays what it was.
+    In a git checkout of this package they include the commit, see :func:`commit`. They are looked
+    up once per process, since its code does not change.
     """
     return dict(_versions())
 
@@ -34,7 +34,7 @@ def _versions() -> dict[str, str]:
     found = {
         "python": platform.python_version(),
         "platform": platform.platform(),
-        # Not from the metadata of an installation: it may be that of another copy.
+        # Not from the metadata of an installation, which may be another copy.
         "torchrl-l1": torchrl_l1.__version__,
     }
     package = Path(torchrl_l1.__file__).parent
@@ -50,18 +50,18 @@ def _versions() -> dict[str, str]:
 
 
 def commit(package: Path) -> str | None:
-    """The commit of the git checkout that a package's folder lies at the top of.
+    """The commit of the git checkout with a package's folder at its top level.
 
     Args:
         package: the folder.
 
     Returns:
-        its hash, followed by ``with changes`` where files of the package differ from it;
-        ``None`` where there is no checkout or no git.
+        its hash, followed by ``with changes`` if files of the package differ from it;
+        ``None`` without a checkout or without git.
     """
     if not (package.parent / ".git").exists():
         return None
-    # Without locks: many runs may ask at once, and beside somebody's own git.
+    # Without locks: many runs may ask at once, while the user runs git too.
     git = ["git", "--no-optional-locks", "-C", str(package.parent)]
     try:
         head = _output([*git, "rev-parse", "HEAD"])
@@ -76,7 +76,7 @@ def _output(command: list[str]) -> str:
 
 
 def code_versions(config: Mapping[str, Any]) -> dict[str, str]:
-    """Digests of the user's files that settings name code of, such as ``sha256 12ab...``, by name.
+    """Digests of the user's code that settings name, such as ``sha256 12ab...``, by name.
 
     Examples:
         >>> code_versions({"task": "hopper", "reward": "builtin"})
@@ -88,7 +88,7 @@ def code_versions(config: Mapping[str, Any]) -> dict[str, str]:
 
 
 def data_version(config: Mapping[str, Any]) -> dict[str, str]:
-    """The digest of the dataset that an offline run names, where it is a file."""
+    """The digest of the dataset that an offline run names, if it is a file."""
     file = Path(str(config.get("dataset") or ""))
     return {str(config["dataset"]): f"sha256 {file_digest(file)}"} if file.is_file() else {}
 
@@ -96,10 +96,10 @@ def data_version(config: Mapping[str, Any]) -> dict[str, str]:
 def differences(
     before: Mapping[str, Any], now: Mapping[str, Any], may_grow: bool = False
 ) -> list[str]:
-    """The settings that differ between two runs and touch the result, a text for each.
+    """The settings that differ between two runs and affect the result, a text for each.
 
-    Settings that the first run does not mention, since it is older than they are, have the
-    schema's defaults.
+    Settings missing from the first run, because it is older than they are, have the schema's
+    defaults.
 
     Args:
         before: configuration of the first run.
@@ -117,7 +117,7 @@ def differences(
     defaults = schema_defaults(now)
     other_code = [] if same_code_in(before, now) else ["search_path"]
     before, now = flatten(before), flatten(now)
-    # Either may be older than a setting: what is stored is not written anew by each version.
+    # Either may be older than a setting: stored configurations are not updated by newer versions.
     before, now = (
         {k: v for k, v in defaults.items() if k in other} | own
         for own, other in ((before, now), (now, before))
@@ -135,6 +135,6 @@ def differences(
 
 
 def same_code_in(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Whether files and modules that settings name are the same in both; paths may differ."""
+    """Whether the files and modules named in both settings are the same; paths may differ."""
     paths = [list(map(str, config.get("search_path") or ())) for config in (before, now)]
     return same_code([str(now.get(key)) for key in NAMING_KEYS], *paths)

@@ -1,4 +1,4 @@
-"""Finding recipes: in a checkout, in the installed package, or in a user's own file."""
+"""Finding recipes: in a checkout, in the installed package, or in users' own files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import torchrl_l1
 from torchrl_l1.atomic import write_atomically
 from torchrl_l1.experiment.errors import RecipeError
 
-# Folders beside the recipes: their groups, and matrices of runs.
+# Folders beside the recipes: their groups, and campaigns.
 _NOT_RECIPES = ("shared", "campaigns")
 
 
@@ -36,15 +36,15 @@ def shared_dir() -> Path:
 
 
 def group_options(group: str) -> list[str]:
-    """Names of the options of a group that all algorithms share."""
+    """Names of the options of a shared group."""
     return sorted(file.stem for file in (shared_dir() / group).glob("*.yaml"))
 
 
 def group_setting(group: str, name: str) -> dict[str, Any]:
-    """The values of a shared recipe group's option, such as ``l1`` and ``paper``.
+    """The values of an option of a shared recipe group, such as ``paper`` of ``l1``.
 
     Raises:
-        ValueError: if the option does not exist; the message lists those that do.
+        ValueError: for an unknown option; the message lists the known ones.
     """
     file = shared_dir() / group / f"{name}.yaml"
     if name not in group_options(group):
@@ -71,7 +71,7 @@ def available_campaigns() -> list[str]:
 
 
 def find_recipe(name: str) -> Path:
-    """The YAML file of a shipped recipe, or of a path to a user's own.
+    """The YAML file of a shipped recipe, or of a user's own, given by its path.
 
     Raises:
         RecipeError: if there is none.
@@ -80,7 +80,7 @@ def find_recipe(name: str) -> Path:
 
 
 def find_campaign(name: str) -> Path:
-    """The YAML file of a shipped campaign, or of a path to a user's own.
+    """The YAML file of a shipped campaign, or of a user's own, given by its path.
 
     Raises:
         RecipeError: if there is none.
@@ -89,13 +89,13 @@ def find_campaign(name: str) -> Path:
 
 
 def yaml_word(text: str) -> str:
-    """A text as a value in a YAML file that is written by hand, quoted where it needs be.
+    """A text as a value in a handwritten YAML file, quoted if necessary.
 
     Examples:
         >>> print(*map(yaml_word, ("envs.py:make_env", "a #1", "1e3", "off")))
         envs.py:make_env 'a #1' '1e3' 'off'
     """
-    # Some words are none for YAML: off, no, null.
+    # YAML does not read some words as strings: off, no, null.
     if re.fullmatch(r"[A-Za-z_/][\w.+/:@-]*(?<!:)", text) and yaml.safe_load(text) == text:
         return text
     return "'" + text.replace("'", "''") + "'"
@@ -106,13 +106,13 @@ def copy_recipe(name: str, file: str | None = None) -> Path:
 
     Args:
         name: such as ``pets/half_cheetah`` or ``table1``.
-        file: the copy, a ``.yaml``; by default it is named like the recipe, in the current folder.
+        file: the copy, a ``.yaml`` file; by default in the current folder, named like the recipe.
 
     Returns:
-        the copy, which runs, under a name of its own.
+        the copy, which can be run and is named after its file.
 
     Raises:
-        RecipeError: if there is no such recipe, or something is in the copy's place.
+        RecipeError: if there is no such recipe, or the copy already exists.
     """
     source = find_campaign(name) if name in available_campaigns() else find_recipe(name)
     copy = Path(file or f"{name.replace('/', '_')}.yaml")
@@ -122,8 +122,8 @@ def copy_recipe(name: str, file: str | None = None) -> Path:
     named = f"recipe: {yaml_word(copy.stem)}"
     text = re.sub(r"(?m)^recipe: \S+$", lambda _: named, text)
     if os.path.lexists(copy):
-        raise RecipeError(f"{copy} is there already; give another FILE")
-    # A part of a campaign may be a campaign, too.
+        raise RecipeError(f"{copy} already exists; give another FILE")
+    # A part of a campaign may itself be a campaign.
     write_atomically(copy, text)
     return copy
 
@@ -136,7 +136,7 @@ def _find(kind: str, name: str, available: list[str], folder: Path) -> Path:
             hint = f"; rename {other}, names must end in .yaml" if other.is_file() else ""
             raise RecipeError(f"{kind} file {name} does not exist{hint}")
         if not own.stem.strip("."):
-            raise RecipeError(f"{kind} file {name} has no name but its dots; rename it")
+            raise RecipeError(f"{kind} file {name} has no name besides dots; rename it")
         return own.resolve()
     if own.suffix == ".yml":
         raise RecipeError(f"{kind} file {name}: its name must end in .yaml, not .yml; rename it")

@@ -16,7 +16,7 @@ from torchrl_l1.experiment.episodes import Episode, split_episodes
 from torchrl_l1.experiment.evaluate import TrainedRun
 
 QUALITIES = ("random", "medium", "expert")
-"""``random`` actions; the final policy with so much noise that its return is ``medium``; or it."""
+"""``random`` actions; the final policy with noise that makes its return ``medium``; or itself."""
 
 MEDIUM = (1 / 3, 1 / 2)
 """Return of ``medium`` data, as a share of the way from ``random`` to ``expert``."""
@@ -26,14 +26,15 @@ _MEASURED, _TRIALS, _MOST_NOISE = 16, 12, 4.0
 
 @dataclass(frozen=True)
 class Recording:
-    """Data, and how good what made them is.
+    """Recorded data, and the quality of the policy that made them.
 
     Attributes:
         episodes: the data.
         quality: one of ``QUALITIES``.
-        noise: standard deviation of what was added to the policy's action, as a fraction of half
-            the range of the action.
-        returns: mean returns of full episodes with random actions, of this, and of the policy.
+        noise: standard deviation of the noise added to the policy's action, as a fraction of half
+            the action range.
+        returns: mean returns of full episodes with random actions, at this quality, and of the
+            policy.
     """
 
     episodes: list[Episode]
@@ -43,23 +44,23 @@ class Recording:
 
     @property
     def transitions(self) -> int:
-        """Steps of all episodes."""
+        """Number of steps of all episodes."""
         return sum(map(len, self.episodes))
 
     @property
     def share(self) -> float:
-        """Where its return is between that of random actions, 0, and that of the policy, 1."""
+        """Its return on a scale from random actions, 0, to the policy, 1."""
         low, own, high = self.returns
         return (own - low) / (high - low) if high != low else math.nan
 
 
 class NoisyPolicy(TensorDictModuleBase):
-    """A policy with normal noise on its action, clipped to the bounds.
+    """A policy with Gaussian noise on its action, clipped to the bounds.
 
     Args:
         policy: writes ``action``.
         task: for the bounds.
-        noise: standard deviation, as a fraction of half the range of the action.
+        noise: standard deviation as a fraction of half the action range.
     """
 
     def __init__(self, policy: TensorDictModuleBase, task: AnyTask, noise: float) -> None:
@@ -73,7 +74,7 @@ class NoisyPolicy(TensorDictModuleBase):
             self.make_tensordict_primer = primer
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the policy's action with noise."""
+        """Write the policy's action with noise added."""
         tensordict = self.policy(tensordict)
         action = tensordict.get("action")
         noisy = action + self.deviation * torch.randn_like(action)
@@ -87,20 +88,21 @@ def record(
     seed: int = 0,
     say: Callable[[str], object] = lambda line: None,
 ) -> Recording:
-    """Undisturbed real episodes of a run's last policy, without L1, of a chosen quality.
+    """Record undisturbed real episodes of a run's last policy, without L1, at a chosen quality.
 
-    The policy's actions are sampled, as in its training. For ``medium`` the noise on top is found
-    by bisection.
+    The policy's actions are sampled, as in training. For ``medium``, the added noise is found by
+    bisection.
 
     Args:
         trained: the run.
         quality: one of ``QUALITIES``.
-        steps: how many at least: whole episodes, or as long as one where they end early.
-        seed: of all that is drawn.
-        say: told what goes on.
+        steps: minimum number of steps: whole episodes, or as many steps as in one if they end
+            early.
+        seed: seed of everything random.
+        say: receives lines on the progress.
 
     Raises:
-        ValueError: for another quality, or if no noise leads to a medium return.
+        ValueError: for an unknown quality, or if no noise gives a medium return.
     """
     if quality not in QUALITIES:
         raise ValueError(f"quality must be one of {', '.join(QUALITIES)}, got {quality!r}")
@@ -139,11 +141,11 @@ def record(
 def _medium_noise(
     measured: Callable[[float], float], low: float, high: float, say: Callable[[str], object]
 ) -> float:
-    """The noise with which the return is a third to a half of the way up."""
+    """The noise for which the return is a third to a half of the way up."""
     if not high > low:
         raise ValueError(
             f"the policy is no better than random actions (returns {high:.4g} and {low:.4g}): "
-            "there is no medium between them"
+            "there is no medium quality between them"
         )
     weak, strong = 0.0, _MOST_NOISE
     for _ in range(_TRIALS):

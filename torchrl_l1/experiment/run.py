@@ -41,7 +41,7 @@ def run(config: DictConfig) -> Path:
 
     Raises:
         RunDirectoryError: if the run directory holds another run.
-        ValueError: if settings contradict each other; nothing has been written then.
+        ValueError: if settings contradict each other; nothing is written in this case.
     """
     check_known(config)
     resolved = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
@@ -77,7 +77,7 @@ def run(config: DictConfig) -> Path:
 def final_return(run_dir: str | Path) -> float:
     """Return of a run by the paper's rule: the mean over the last outer iterations.
 
-    With several stages they are of the last one only. NaN if there are none yet.
+    With several stages, only those of the last stage count. NaN if there are none yet.
 
     Args:
         run_dir: a run directory.
@@ -88,7 +88,7 @@ def final_return(run_dir: str | Path) -> float:
     if not rows:
         return math.nan
     facts = schema_of(read_config(directory.config_file)).builds.facts
-    # Where there is only one stage, metrics do not count it.
+    # With a single stage, metrics do not include it.
     position = int(rows[-1]["stage"]) - 1 if facts.named_stages else 0
     ending = [row for row in rows if row.get("stage") == rows[-1].get("stage")]
     returns = [float(row["return_mean"]) for row in ending[-facts.stages[position].window :]]
@@ -110,13 +110,13 @@ def _run(
         rows, timings = checkpoint["metrics"], checkpoint["timings"]
         progress.update(len(rows))
         if directory.last_is_good:
-            # A kill has come between the checkpoint and the files made from it, or they changed.
+            # The run was killed between the checkpoint and the files made from it, or they changed.
             directory.tell_divergence(rows)
             keep_checkpoints(directory.checkpoint_file, recipe.checkpoint, rows, progress.write)
             restored = directory.restore_results(algorithm.weights(), rows, timings)
             if restored:
                 names = ", ".join(restored)
-                progress.write(f"{directory.path}: written again from the checkpoint: {names}")
+                progress.write(f"{directory.path}: rewritten from the checkpoint: {names}")
         if len(rows) >= recipe.outer_iterations and not lacks(recipe, directory.path, rows):
             progress.write(f"{directory.path} is complete: nothing to do")
             return
@@ -138,13 +138,13 @@ def _run(
                 for error in result.diverged:
                     progress.write(f"on_divergence=warn: {error}")
                 if asked_to_make_room() and len(rows) < recipe.outer_iterations:
-                    progress.write(f"{directory.path}: saved; go on with --resume")
+                    progress.write(f"{directory.path}: saved; continue with --resume")
                     sys.exit(RESUME_ME)
         except Diverged as error:
             directory.mark_diverged(str(error), rows)
-            warn = ", and on_divergence=warn goes on all the same" * error.may_go_on
+            warn = ", and on_divergence=warn continues all the same" * error.may_go_on
             raise RunDirectoryError(
-                f"{directory.path}: {error}; the checkpoint of {len(rows)} iterations stays{warn}"
+                f"{directory.path}: {error}; the checkpoint of {len(rows)} iterations is kept{warn}"
             ) from error
 
 
@@ -157,7 +157,7 @@ def _save(
     rows: list[dict[str, Any]],
     timings: list[dict[str, Any]],
 ) -> None:
-    """Write what an outer iteration has led to."""
+    """Write the results of an outer iteration."""
     marks = {"diverged": len(result.diverged)} if result.diverged else {}
     rows.append({**result.metrics, **marks})
     timings.append({"iteration": result.metrics["iteration"], **result.seconds})

@@ -1,4 +1,4 @@
-"""The directory of a run: what is written, how, and how a run is found again."""
+"""The directory of a run: its files, how they are written, and how runs are found again."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from torchrl_l1.experiment.provenance import (
     versions,
 )
 
-# What a run killed in its first moments may leave behind; its directory is still free.
+# Files that a run killed in its first moments may leave; its directory is still free.
 _BEFORE_CONFIG = (".lock", "versions.json", "versions.json.tmp", "config.yaml.tmp")
 
-# Settings that a run may go on with and that count for what is done with it later.
+# Settings that may change when a run continues and that matter to its later use.
 _RENEWED = (MAY_GROW, "search_path")
 
 # Files whose checksums are kept; the tables' by their number of rows.
@@ -49,11 +49,11 @@ class RunDirectory:
 
     ``config.yaml`` (resolved), ``versions.json``, ``metrics.csv`` (one row per outer iteration,
     the source of truth), ``timing.csv`` (wall-clock seconds by phase), ``checkpoint.pt``, the one
-    before it and those that are kept, ``model.pt``, ``policy.pt``, ``checksums.json`` of these,
-    ``diverged.txt`` where a row has a mark, and W&B's own files.
+    before it and kept ones, ``model.pt``, ``policy.pt``, ``checksums.json`` of these,
+    ``diverged.txt`` if a row is marked, and W&B's own files.
     All are replaced atomically, the checkpoint first and the metrics last, so that a row of the
-    metrics says that its iteration is complete. Where one is not what the checkpoint says, it is
-    made again when the run resumes.
+    metrics means that its iteration is complete. A file that does not match the checkpoint is
+    rewritten when the run resumes.
 
     Args:
         path: the directory.
@@ -69,11 +69,11 @@ class RunDirectory:
         self.timing_file = self.path / "timing.csv"
         self.checksums_file = self.path / "checksums.json"
         self.diverged_file = self.path / "diverged.txt"
-        # Whether the last checkpoint may take the place of the one before it.
+        # Whether the last checkpoint may replace the one before it.
         self.last_is_good = True
 
     def check_open(self, config: dict[str, Any], resume: bool) -> None:
-        """Refuse a directory that a run of ``config`` cannot begin or go on in.
+        """Refuse a directory in which a run of ``config`` cannot begin or continue.
 
         Raises:
             RunDirectoryError: if it holds a run and ``resume`` is not set, if that run has
@@ -93,7 +93,7 @@ class RunDirectory:
 
     @contextmanager
     def open(self, config: dict[str, Any], resume: bool) -> Iterator[None]:
-        """Prepare the directory for a run of ``config`` and hold it for as long as that lasts.
+        """Prepare the directory for a run of ``config`` and lock it for the duration of the block.
 
         Raises:
             RunDirectoryError: as :meth:`check_open`, or (:class:`RunDirectoryInUse`) if another
@@ -108,7 +108,7 @@ class RunDirectory:
                 found = {**versions(), **code_versions(config), **data_version(config)}
                 write_atomically(self.versions_file, json.dumps(found, indent=2))
             stored = self._stored()
-            # Folders of the user's code may have moved; what evaluates the run looks there, too.
+            # Folders of the user's code may have moved; evaluations of the run look there too.
             if not resume or any((stored.get(k) or []) != (config.get(k) or []) for k in _RENEWED):
                 write_atomically(self.config_file, OmegaConf.to_yaml(OmegaConf.create(config)))
             yield
@@ -117,7 +117,7 @@ class RunDirectory:
         return read_config(self.config_file) if self.config_file.exists() else {}
 
     def free(self) -> bool:
-        """Whether a run may begin here: there is nothing but what one killed at once has left."""
+        """Whether a run may begin here: there is nothing but remains of one killed at once."""
         if not self.path.exists():
             return True
         return self.path.is_dir() and all(f.name in _BEFORE_CONFIG for f in self.path.iterdir())
@@ -127,15 +127,15 @@ class RunDirectory:
         lock = self.path / ".lock"
         if not lock.exists():
             return False
-        # Nothing is made or changed; a directory may be somebody else's, to be read only.
+        # Nothing is created or changed: the directory may be somebody else's and read-only.
         with locked(lock, "r+" if os.access(lock, os.W_OK) else "r") as free:
             return not free
 
     def check_same(self, config: dict[str, Any]) -> None:
-        """Compare ``config`` with that of the run that the directory holds.
+        """Compare ``config`` with that of the run in the directory.
 
         Raises:
-            RunDirectoryError: if a setting differs that touches the result, see
+            RunDirectoryError: if a setting differs that affects the result, see
                 :func:`differences`.
         """
         different = differences(self._stored(), config, may_grow=True)
@@ -146,9 +146,9 @@ class RunDirectory:
             )
 
     def iterations_done(self) -> int:
-        """Outer iterations that are complete: the rows of the metrics.
+        """Number of complete outer iterations: the rows of the metrics.
 
-        None of a table that is not as it was written: it is made again when the run resumes.
+        Zero for a table that is not as it was written: it is rewritten when the run resumes.
         """
         if not self.checkpoint_file.exists():
             return 0
@@ -160,7 +160,7 @@ class RunDirectory:
         return 0 if rows and self._table_problem(self.metrics_file, text) else rows
 
     def metrics_problem(self) -> str | None:
-        """What is wrong with the metrics; ``None`` where nothing is, or it cannot be told."""
+        """What is wrong with the metrics; ``None`` if nothing, or if it cannot be known."""
         try:
             return self._table_problem(self.metrics_file, read_text(self.metrics_file))
         except FileNotFoundError:
@@ -184,14 +184,14 @@ class RunDirectory:
             return False
 
     def _checksums(self) -> dict[str, Any]:
-        """Empty for a run that is older than they are."""
+        """Stored checksums; empty for a run older than they are."""
         try:
             known = json.loads(read_text(self.checksums_file))
         except (FileNotFoundError, NotADirectoryError):
             return {}
         except (OSError, ValueError, RecursionError):
             known = None
-        # What cannot be read fits nothing.
+        # Unreadable checksums match nothing.
         return known if isinstance(known, dict) else dict.fromkeys((*_TABLES, *_WEIGHTS), "?")
 
     def _table_problem(self, file: Path, text: str) -> str | None:
@@ -202,8 +202,8 @@ class RunDirectory:
         if isinstance(known, dict) and known.get(rows) == digest(text):
             return None
         return (
-            f"{file} is not as it was written (see {self.checksums_file.name}); --resume writes it "
-            "again from the checkpoint"
+            f"{file} is not as it was written (see {self.checksums_file.name}); --resume rewrites "
+            "it from the checkpoint"
         )
 
     def save_checkpoint(self, state: dict[str, Any]) -> None:
@@ -220,15 +220,15 @@ class RunDirectory:
         config: Mapping[str, Any] | None = None,
         say: Callable[[str], object] = lambda line: print(line, file=sys.stderr),
     ) -> dict[str, Any] | None:
-        """The last checkpoint that can be read, or ``None`` if there is none yet.
+        """The last readable checkpoint, or ``None`` if there is none yet.
 
         Args:
-            config: of the run; that of the directory by default.
-            say: told in a line where it is not the last one, or of another version of torch.
+            config: configuration of the run; that of the directory by default.
+            say: receives a line if it is not the last one, or of another version of torch.
 
         Raises:
-            RunDirectoryError: if none can be read though there are results, or if it is of another
-                configuration.
+            RunDirectoryError: if none can be read although there are results, or if it is of
+                another configuration.
         """
         problems = []
         state: dict[str, Any] | None = None
@@ -246,12 +246,12 @@ class RunDirectory:
         self.last_is_good = state is not None and not problems
         if state is not None and problems:
             done = len(state["metrics"])
-            say(f"{problems[0]}; {self.previous_file.name} is used, of {done} iterations")
+            say(f"{problems[0]}; {self.previous_file.name} of {done} iterations is used instead")
         for name in self.changed_files(config or self._stored()) if state is not None else ():
-            say(f"{name} is not as it was when the run in {self.path} began; it is used as it is")
+            say(f"{name} has changed since the run in {self.path} began; it is used as it is")
         if state is None and self._has_results():
             raise RunDirectoryError(
-                f"{'; '.join(problems)}; but there are results, which are left as they are: choose "
+                f"{'; '.join(problems)}; but there are results, which are left untouched: choose "
                 "another run_dir to start over"
             )
         if state is None and self.checkpoint_file.exists():
@@ -259,11 +259,11 @@ class RunDirectory:
         return state
 
     def changed_files(self, config: Mapping[str, Any], data: bool = False) -> list[str]:
-        """Files of the user's that ``config`` names and that have changed since the run began.
+        """The user's files named in ``config`` that have changed since the run began.
 
         Args:
-            config: of the run.
-            data: whether the dataset is one of them; a run that goes on has its data already.
+            config: configuration of the run.
+            data: whether to include the dataset; a run that continues already has its data.
         """
         try:
             began = json.loads(read_text(self.versions_file))
@@ -274,7 +274,7 @@ class RunDirectory:
         return [name for name, version in found.items() if known.get(name, version) != version]
 
     def load_kept(self, file: Path) -> dict[str, Any]:
-        """A checkpoint that the run has kept.
+        """Load a kept checkpoint of the run.
 
         Raises:
             RunDirectoryError: if it cannot be read, or is of another configuration.
@@ -294,7 +294,7 @@ class RunDirectory:
         config: Mapping[str, Any],
         say: Callable[[str], object],
     ) -> None:
-        """Older checkpoints do not say what they are of."""
+        """Refuse a checkpoint of another configuration; older ones do not tell theirs."""
         settings = state.get("settings")
         if isinstance(settings, dict) and config:
             different = differences(settings, config, may_grow=True)
@@ -305,7 +305,7 @@ class RunDirectory:
                 )
         other = state.get("torch")
         if other is not None and other != str(torch.__version__):
-            say(f"{file} was written with torch {other}, this is {torch.__version__}")
+            say(f"{file} was written with torch {other}, this is torch {torch.__version__}")
 
     def write_results(
         self,
@@ -313,10 +313,10 @@ class RunDirectory:
         rows: Sequence[Mapping[str, Any]],
         timings: Sequence[Mapping[str, Any]],
     ) -> None:
-        """Write all that follows from a checkpoint.
+        """Write all files derived from a checkpoint.
 
         The metrics come last: whoever finds the last row takes the run for finished and never
-        comes back to it.
+        returns to it.
         """
         for file, content in self._results(weights, rows, timings).items():
             write_atomically(file, content)
@@ -327,7 +327,7 @@ class RunDirectory:
         rows: Sequence[Mapping[str, Any]],
         timings: Sequence[Mapping[str, Any]],
     ) -> list[str]:
-        """Write what is not as the checkpoint says; the names of these files."""
+        """Rewrite files that do not match the checkpoint; returns their names."""
         restored = []
         for file, content in self._results(weights, rows, timings).items():
             try:
@@ -340,11 +340,11 @@ class RunDirectory:
         return restored
 
     def tell_divergence(self, rows: Sequence[Mapping[str, Any]], line: str = "") -> None:
-        """Have ``diverged.txt`` as long as a row has a mark, and no longer.
+        """Keep ``diverged.txt`` exactly as long as a row is marked.
 
         Args:
-            rows: those so far.
-            line: what it is to say; if empty, what it says already, or which iteration it was.
+            rows: the rows so far.
+            line: its text; if empty, the existing text, or else the iteration.
         """
         marked = [row for row in rows if "diverged" in row]
         if not marked:
@@ -354,7 +354,7 @@ class RunDirectory:
             write_atomically(self.diverged_file, f"{line}\n")
 
     def mark_diverged(self, line: str, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Say that the run has stopped after these rows, the last of which gets a mark."""
+        """Record that the run has stopped after these rows, and mark the last one."""
         write_atomically(self.diverged_file, line + "\n")
         if not rows:
             return
@@ -372,14 +372,14 @@ class RunDirectory:
         rows: Sequence[Mapping[str, Any]],
         timings: Sequence[Mapping[str, Any]],
     ) -> dict[Path, bytes]:
-        """Contents of files, in the order in which they are to be written."""
+        """Contents of files in the order in which to write them."""
         files = {self.path / f"{name}.pt": saved(state) for name, state in weights.items()}
         checksums: dict[str, Any] = {file.name: digest(content) for file, content in files.items()}
         checksums[self.checkpoint_file.name] = self.checkpoint_file.stat().st_size
         tables = {self.timing_file: timings, self.metrics_file: rows}
         texts = {file: table_text(table) for file, table in tables.items()}
         for file, table in tables.items():
-            # The one before stands until this one is there.
+            # The previous table stays valid until this one is written.
             before = {str(len(table) - 1): digest(table_text(table[:-1]))} if table[1:] else {}
             checksums[file.name] = {**before, str(len(table)): digest(texts[file])}
         return {
@@ -391,16 +391,16 @@ class RunDirectory:
 
 
 def _shortened(items: Sequence[str], most: int = 8) -> str:
-    """A list in one line."""
+    """A list as one line."""
     rest = f"; and {len(items) - most} more" if len(items) > most else ""
     return "; ".join(items[:most]) + rest
 
 
 def run_directories(folder: Path) -> Iterator[tuple[Path, dict[str, Any] | RunDirectoryError]]:
-    """Every run directory in or below a folder, with its configuration or why that is unreadable.
+    """Every run directory in or below a folder, with its configuration or the error on reading it.
 
-    Folders come in alphabetical order; hidden ones, and those that are links, are left out. One
-    that cannot be looked into counts as a run directory that is unreadable.
+    Folders come in alphabetical order; hidden ones and links are left out. A folder that cannot
+    be listed counts as an unreadable run directory.
     """
     closed: list[OSError] = []
     for path, below, files in os.walk(folder, onerror=closed.append):
@@ -412,7 +412,7 @@ def run_directories(folder: Path) -> Iterator[tuple[Path, dict[str, Any] | RunDi
             config = read_config(Path(path) / "config.yaml")
         except RunDirectoryError as error:
             config = error
-        # Any tool may keep a config.yaml; a run's says which task and which seed.
+        # Any tool may keep a config.yaml; that of a run has a task and a seed.
         if isinstance(config, RunDirectoryError) or ("task" in config and "seed" in config):
             below.clear()
             yield Path(path), config
@@ -421,7 +421,7 @@ def run_directories(folder: Path) -> Iterator[tuple[Path, dict[str, Any] | RunDi
 
 
 def read_config(file: Path) -> dict[str, Any]:
-    """A configuration; empty if the file holds something else than keys and values.
+    """Read a configuration; empty if the file holds anything but keys and values.
 
     Raises:
         RunDirectoryError: if the file cannot be read.
@@ -430,7 +430,7 @@ def read_config(file: Path) -> dict[str, Any]:
         config = settings_content(file)
     except (yaml.YAMLError, RecursionError) as error:
         raise RunDirectoryError(f"cannot read {file}: {problem(error)}") from error
-    # OmegaConf's own errors come in many kinds.
+    # OmegaConf's own errors are of many kinds.
     except Exception as error:
         raise RunDirectoryError(f"cannot read {file}: {message(error)}") from error
     return {str(k): v for k, v in config.items()} if isinstance(config, dict) else {}

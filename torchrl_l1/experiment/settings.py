@@ -39,31 +39,31 @@ from torchrl_l1.experiment.files import bounded_overrides, path_text
 
 @dataclass
 class L1Settings:
-    """The adaptive controller of a recipe: settings of :class:`L1Config`, and two more.
+    """The adaptive controller of a recipe: the settings of :class:`L1Config`, and two more.
 
     Attributes:
         enabled: whether L1 acts during collection.
-        epsilon: tolerance of the switching law, raw state units.
+        epsilon: tolerance of the switching law, in raw state units.
         alpha: smoothing factor of the low-pass filter per step; or give ``cutoff``.
         cutoff: cutoff frequency of the low-pass filter, rad/s.
         a_s: diagonal of the predictor's Hurwitz matrix, 1/s.
         on_switch: ``keep`` or ``reset`` predictor and filter at a switch.
         switch_on: the switching law looks at the ``policy`` action or the ``executed`` input.
         filter_input: the filter takes the ``current`` or the ``previous`` estimate.
-        project: bound the estimate that enters the filter to the range of the action.
+        project: clip the estimate that enters the filter to the range of the action.
         estimator: ``least_squares``, or ``weighted`` by the covariance of the residuals.
         filter: ``low_pass``, or ``kalman``, which needs no ``alpha`` or ``cutoff``.
-        covariance: where it comes from: ``residuals``, ``heads``, ``disagreement`` or ``sum``.
+        covariance: source of the covariance: ``residuals``, ``heads``, ``disagreement`` or ``sum``.
         dead_zone: posterior standard deviations within which the Kalman filter does nothing.
-        process_noise: change of the disturbance per step that it expects, fraction of half the
-            range of the action; if null, what the model says of itself, or else 0.01.
-        inflation: factor on the covariance; if null, what the model says of itself, or else 1.
-        initial_deviation: standard deviation of the disturbance at a reset, same units.
+        process_noise: change of the disturbance per step that the Kalman filter expects, as a
+            fraction of half the action range; if null, the model's calibrated value, or else 0.01.
+        inflation: factor on the covariance; if null, the model's calibrated value, or else 1.
+        initial_deviation: standard deviation of the disturbance at a reset, in the same units.
         forgetting: factor per step of the running estimate of each state's noise; 1 for none.
         skill_forgetting: factor per step of the record of what its forecasts have gained, by which
             the input is scaled; 1 for none.
-        compile: compile the controller's step: ``true``, ``false``, or ``auto`` where a compiler
-            works. It takes some tens of seconds and pays in long collections.
+        compile: compile the controller's step: ``true``, ``false``, or ``auto`` if a compiler
+            works. Compiling takes some tens of seconds and pays off in long collections.
     """
 
     enabled: bool = False
@@ -87,10 +87,10 @@ class L1Settings:
     compile: bool | str = False
 
 
-# Of L1Settings, what is no setting of L1Config.
+# The settings of L1Settings that are not in L1Config.
 _BESIDE_L1_CONFIG = ("enabled", "compile")
 
-# A time step, s, that is not too long for any rate.
+# A time step in seconds that is short enough for any rate.
 _SHORT_STEP = 1e-12
 
 
@@ -103,9 +103,9 @@ class WandbSettings:
             ``disabled``.
         project: name of the project.
         entity: user or team; W&B's default if null.
-        group: that the run belongs to.
-        name: of the run; recipe, what differs from it, and seed if null.
-        tags: words to find it by.
+        group: group of the run.
+        name: name of the run; if null, the recipe, its overrides and the seed.
+        tags: tags to find it by.
         notes: a longer text.
     """
 
@@ -128,22 +128,22 @@ class RunSettings(ABC):
         recipe: the recipe's name, as given on the command line.
         task: a task of :data:`torchrl_l1.envs.TASKS`, or any environment by name, see
             :func:`torchrl_l1.envs.environment_source`.
-        dt: seconds of a step, where an environment of elsewhere does not tell.
-        observation_keys: parts of the observation, where that of an environment comes in parts.
-        search_path: folders for files and modules that the recipe names; found as it is composed.
+        dt: seconds per step, if an external environment does not tell.
+        observation_keys: parts of the observation, if an environment's comes in parts.
+        search_path: folders for files and modules that the recipe names; set when it is composed.
         seed: seed of every random stream.
-        run_dir: where the run's files go; a long list of overrides is shortened in its name.
+        run_dir: folder for the run's files; a long list of overrides is shortened in its name.
         resume: continue the run in ``run_dir`` from its last checkpoint.
         threads: CPU threads of torch.
-        device: ``cpu``, ``cuda`` or ``auto`` (CUDA where there is one).
+        device: ``cpu``, ``cuda`` or ``auto`` (CUDA if available).
         horizon: steps per real episode; the task's own if null.
-        reward: of imagined trajectories: ``builtin``, the task's own; ``learned``, by a model that
-            is fitted with the dynamics; or ``MODULE:FUNCTION`` or ``FILE.py:FUNCTION``.
-        termination: of imagined trajectories, likewise, or ``none``. Where it is ``builtin``,
-            METRPO goes by ``imagined_termination``.
+        reward: reward of imagined trajectories: ``builtin``, the task's own; ``learned``, by a
+            model that is fitted with the dynamics; or ``MODULE:FUNCTION`` or ``FILE.py:FUNCTION``.
+        termination: termination of imagined trajectories, likewise, or ``none``. If it is
+            ``builtin``, METRPO follows ``imagined_termination``.
         outcome_model: see :class:`~torchrl_l1.algorithms.OutcomeConfig`.
-        on_divergence: ``stop`` or ``warn`` where losses, weights or plans are no longer finite.
-        loggers: of ``wandb`` and ``tensorboard``; none if empty.
+        on_divergence: ``stop`` or ``warn`` when losses, weights or plans are no longer finite.
+        loggers: any of ``wandb`` and ``tensorboard``; none if empty.
         l1: see :class:`L1Settings`.
         perturbation: noise and disturbances of the real environment.
         wandb: see :class:`WandbSettings`.
@@ -176,10 +176,10 @@ class RunSettings(ABC):
     builds: ClassVar[type[Algorithm]]
 
     def check(self) -> None:
-        """Refuse settings that could only fail later, the algorithm's own included.
+        """Refuse settings that would only fail later, including the algorithm's own.
 
-        Whether there is a CUDA device is not asked here: a run that was trained on one may be
-        read anywhere.
+        The presence of a CUDA device is not checked here: a run trained on one may be read
+        anywhere.
 
         Raises:
             ValueError: naming the setting.
@@ -203,18 +203,18 @@ class RunSettings(ABC):
 
     @abstractmethod
     def collected_episodes(self, iterations: int) -> int:
-        """Real episodes of so many outer iterations; random data do not count."""
+        """Number of real episodes in so many outer iterations; random data do not count."""
 
     def stages(self) -> tuple[str, ...]:
         """Names of the stages that ``outer_iterations`` reaches."""
         return self.builds.facts.stage_names
 
     def real_task(self) -> AnyTask:
-        """What the recipe is about.
+        """The task of the recipe.
 
         Raises:
             KeyError: if there is no task of that name.
-            ValueError: for an environment that will not do, or does not tell what must be known.
+            ValueError: for an unsuitable environment, or one that does not tell what is needed.
         """
         return get_task(
             self.task,
@@ -225,7 +225,7 @@ class RunSettings(ABC):
         )
 
     def build(self) -> Algorithm:
-        """The algorithm that the recipe describes, fresh.
+        """A fresh instance of the algorithm that the recipe describes.
 
         Raises:
             ValueError: if settings contradict each other.
@@ -249,24 +249,24 @@ class RunSettings(ABC):
         return algorithm
 
     def build_on_cpu(self) -> Algorithm:
-        """As :meth:`build`, for a look on any machine: on the CPU, and nothing compiled."""
+        """As :meth:`build`, for reading a run on any machine: on the CPU and not compiled."""
         here: dict[str, Any] = {"device": "cpu"}
         if hasattr(self, "compile_plans"):
             here["compile_plans"] = False  # as "auto" decides on the CPU
         return replace(self, **here).build()
 
 
-# Not in ``register``: launchers resolve them in processes of their own.
+# Not in ``register``: launchers resolve them in separate processes.
 OmegaConf.register_new_resolver("bounded", bounded_overrides, replace=True)
 OmegaConf.register_new_resolver("path_text", path_text, replace=True)
 
-# Keys that may differ between a run and its continuation: they do not touch the result.
+# Keys that may differ between a run and its continuation: they do not affect the result.
 VOLATILE_KEYS = (
     *("run_dir", "resume", "wandb", "on_divergence", "loggers", "checkpoint", "search_path"),
 )
 
 NAMING_KEYS = ("task", "reward", "termination")
-"""Keys that may name code of the user's, which the search path is for."""
+"""Keys that may name the user's code, which is found by the search path."""
 
 
 def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
@@ -285,9 +285,9 @@ def flatten(node: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def check_known(config: DictConfig) -> None:
-    """Make sure that a composed recipe has a schema and no key that this does not know.
+    """Make sure that a composed recipe has a schema and no key that is not in it.
 
-    Hydra lets ``+key=value`` add one, which nobody would read.
+    Hydra lets ``+key=value`` add one, which would be ignored.
 
     Raises:
         ValueError: naming the key.
@@ -302,7 +302,7 @@ def check_known(config: DictConfig) -> None:
     for key in _unknown(config, "", known):
         close = get_close_matches(key, known, n=1)
         hint = f"; did you mean {close[0]}?" if close else ""
-        raise ValueError(f"there is no key {key!r}, and + adds none{hint}")
+        raise ValueError(f"there is no key {key!r}, and + cannot add one{hint}")
 
 
 def _unknown(node: DictConfig, prefix: str, known: list[str]) -> list[str]:
@@ -322,12 +322,12 @@ def l1_config(settings: L1Settings, task: str | AnyTask) -> L1Config | None:
     """The controller that a recipe asks for on a task; ``None`` if it is off.
 
     Raises:
-        ValueError: for settings that contradict each other, see :class:`L1Config`. Of those of a
-            controller that is off, what would at any time step.
+        ValueError: for settings that contradict each other, see :class:`L1Config`; if the
+            controller is off, only for those that do so at any time step.
     """
     own = {name: value for name, value in vars(settings).items() if name not in _BESIDE_L1_CONFIG}
     if not settings.enabled:
-        # Which filter would be turned on nobody knows: what is another's contradicts nothing.
+        # The filter is not known while L1 is off: settings of another filter are no contradiction.
         of_kalman = {name: own.pop(name) for name in ("process_noise", "inflation")}
         L1Config(_SHORT_STEP, **own)
         L1Config.robust(_SHORT_STEP, **of_kalman)
@@ -336,7 +336,7 @@ def l1_config(settings: L1Settings, task: str | AnyTask) -> L1Config | None:
     return L1Config(task.dt, **own, action_low=task.action_low, action_high=task.action_high)
 
 
-# The algorithm's settings come first: they say how many outer iterations there are.
+# The algorithm's settings come first: they set the number of outer iterations.
 @dataclass
 class METRPORecipe(METRPOConfig, RunSettings):
     """A METRPO recipe: run settings and the algorithm's own, side by side.
@@ -391,7 +391,7 @@ class OfflineRecipe(OfflineConfig, RunSettings):
         self.check()
 
     def build(self) -> Algorithm:
-        """The algorithm, which reads the dataset when it begins: to evaluate it none is needed."""
+        """The algorithm, which reads the dataset only when it starts: evaluations need none."""
         algorithm = super().build()
         assert isinstance(algorithm, Offline)
         algorithm.data = partial(read_dataset, self.dataset, self.columns)
@@ -415,10 +415,10 @@ def register() -> None:
 
 
 def schema_of(config: Mapping[str, Any]) -> type[RunSettings]:
-    """The schema of a stored configuration; of METRPO for those that are older than others.
+    """The schema of a stored configuration; METRPO's if it is too old to name an algorithm.
 
     Raises:
-        ValueError: for an algorithm that there is not.
+        ValueError: for an unknown algorithm.
     """
     name = str(config.get("algorithm", "metrpo"))
     if name not in SCHEMAS:
@@ -427,7 +427,7 @@ def schema_of(config: Mapping[str, Any]) -> type[RunSettings]:
 
 
 def schema_defaults(config: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Every key of a configuration's schema that has a default, dotted, with that default."""
+    """Defaults of a configuration's schema by dotted key."""
     return _defaults(schema_of(config).algorithm)
 
 

@@ -1,4 +1,4 @@
-"""What ends a process: a line, an orderly end, and a status that says what to do next."""
+"""Ending a process on a signal: a line, an orderly exit, and a status that says what to do."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from types import FrameType
 
 RESUME_ME = 75
-"""Status of a run that was asked to make room: it has saved its work, start it with --resume."""
+"""Exit status of a run asked to make room: it has saved its work; start it with --resume."""
 
 _ENDING = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
 _WARNING = [getattr(signal, n) for n in ("SIGUSR1",) if hasattr(signal, n)]
@@ -20,18 +20,18 @@ _asked = False
 
 
 def asked_to_make_room() -> bool:
-    """Whether SIGUSR1 has come, as schedulers send it before they end a job."""
+    """Whether SIGUSR1 has arrived, which schedulers send before they end a job."""
     return _asked
 
 
 @contextmanager
 def orderly_end() -> Iterator[None]:
-    """End the process in order when it is told to, for as long as the block lasts.
+    """Exit in an orderly way on signals during the block.
 
-    SIGINT, SIGTERM and SIGHUP write a line and raise ``SystemExit`` with 128 and their number, so
-    that loggers are closed; a second one ends the process at once. SIGUSR1 lets the outer
-    iteration be finished, see :func:`asked_to_make_room`. Other threads than the main one get no
-    signals: nothing changes there.
+    SIGINT, SIGTERM and SIGHUP write a line and raise ``SystemExit`` with 128 plus their number, so
+    that loggers are closed; a second one ends the process at once. After SIGUSR1 the outer
+    iteration is finished first, see :func:`asked_to_make_room`. Threads other than the main one
+    receive no signals: nothing changes there.
     """
     global _asked
     if threading.current_thread() is not threading.main_thread():
@@ -55,13 +55,13 @@ def orderly_end() -> Iterator[None]:
     before = {
         number: signal.signal(number, handler)
         for number, handler in handlers.items()
-        # What is ignored, as by nohup, stays so.
+        # Ignored signals, as under nohup, stay ignored.
         if signal.getsignal(number) is not signal.SIG_IGN
     }
     try:
         yield
     finally:
-        # What the signal asked for has been done, or cannot be done any more.
+        # The signal's request has been met, or can no longer be met.
         _asked = False
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)

@@ -1,6 +1,6 @@
-"""Where a run's metrics go beside its tables: W&B and TensorBoard, complete after any kill.
+"""Logging of a run's metrics beside its tables: W&B and TensorBoard, complete after any kill.
 
-What they lack of ``metrics.csv`` when a run goes on is logged then, and nothing twice.
+Rows of ``metrics.csv`` that they lack are logged when a run continues, and nothing twice.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from torchrl_l1.experiment.wandb_files import has_ended, known_id, take_over
 
 MODES = ("auto", "online", "offline", "disabled")
 
-# What W&B takes from the environment, older words among it.
+# The modes that W&B accepts from the environment, including older names.
 _WANDB_MODES = ("online", "offline", "disabled", "shared", "run", "dryrun")
 _ONLINE = ("online", "shared", "run")
 
 LOGGERS = ("wandb", "tensorboard")
-"""What a recipe's ``loggers`` may name."""
+"""Loggers that a recipe may name."""
 
 Row = Mapping[str, Any]
 
@@ -42,10 +42,10 @@ _PATIENCE = 10.0
 
 
 def check_wandb_mode(mode: str) -> None:
-    """Make sure that W&B can be used like this.
+    """Make sure that W&B can be used in a mode.
 
     Raises:
-        ValueError: for an unknown mode, or one that needs a key where there is none.
+        ValueError: for an unknown mode, or one that needs a missing API key.
     """
     if mode not in MODES:
         raise ValueError(f"wandb.mode must be one of {', '.join(MODES)}, got {mode!r}")
@@ -66,7 +66,7 @@ def check_loggers(recipe: RunSettings) -> None:
     """Make sure that all loggers of a recipe can be used.
 
     Raises:
-        ValueError: naming the setting, and what to do.
+        ValueError: naming the setting and the remedy.
     """
     for name in recipe.loggers:
         check_choice("loggers", name, LOGGERS)
@@ -80,29 +80,29 @@ def check_loggers(recipe: RunSettings) -> None:
 
 
 def _check_words(settings: WandbSettings) -> None:
-    """Refuse names that W&B would refuse when the run has begun."""
+    """Refuse names that W&B would refuse only after the run has begun."""
     for key, field in (("project", "project"), ("tags", "run_tags")):
         given: dict[str, Any] = {field: getattr(settings, key)}
         try:
             wandb.Settings(**given)
         except (ValueError, wandb.errors.Error) as error:
-            # Pydantic's has several lines, with an address.
+            # Pydantic's message has several lines and a URL.
             why = error.errors()[0]["msg"] if hasattr(error, "errors") else error
             raise ValueError(f"wandb.{key}: {why}") from error
 
 
 def chosen_mode(mode: str) -> str:
-    """What ``auto`` has become: ``online`` where there is a key that works, else ``offline``."""
+    """The mode that ``auto`` stands for: ``online`` with a working key, else ``offline``."""
     if mode != "auto":
         return mode
-    # An explicit WANDB_MODE, as users set it on clusters, has the last word.
+    # An explicit WANDB_MODE, as set on clusters, takes precedence.
     return os.environ.get("WANDB_MODE") or ("online" if _logged_in() else "offline")
 
 
 def _has_key() -> bool:
     try:
         return bool(wandb.login(prompt=False, verify=False))
-    except wandb.errors.Error as error:  # what is there is no key
+    except wandb.errors.Error as error:  # there is a key, but it is malformed
         raise ValueError(f"W&B: {message(error)}") from error
 
 
@@ -110,17 +110,17 @@ def _logged_in() -> bool:
     try:
         return bool(wandb.login(prompt=False))
     except wandb.errors.Error:
-        # A key without a network that would accept it: nothing is lost offline.
+        # A key but no network to verify it: nothing is lost offline.
         return False
 
 
 @dataclass
 class Evaluated:
-    """What an evaluation has led to.
+    """The results of an evaluation.
 
     Attributes:
-        name: of the evaluation, such as ``evaluation``.
-        rows: of its table.
+        name: name of the evaluation, such as ``evaluation``.
+        rows: rows of its table.
         pictures: charts, filmstrips (``.png``) and films (``.gif``, ``.mp4``).
     """
 
@@ -143,11 +143,11 @@ class Tracker(ABC):
 
     @abstractmethod
     def evaluation(self, evaluated: Evaluated) -> None:
-        """Log table and pictures of an evaluation."""
+        """Log the table and pictures of an evaluation."""
 
     @abstractmethod
     def close(self, status: int = 0) -> None:
-        """Flush and close; ``status`` is that of the process, 0 if all went well."""
+        """Flush and close; ``status`` is the exit status of the process, 0 for success."""
 
 
 def _values(metrics: Row, timing: Row) -> dict[str, Any]:
@@ -157,19 +157,19 @@ def _values(metrics: Row, timing: Row) -> dict[str, Any]:
 
 
 class WandbTracker(Tracker):
-    """Weights & Biases, with the files that it has written so far.
+    """Weights & Biases, continuing from the files that it has written so far.
 
-    Each row is written at once, with a step that is behind all others; ``iteration`` is the axis
-    of the charts.
+    Each row is written at once, with a step after all others; ``iteration`` is the axis of the
+    charts.
 
     Args:
-        mode: as :func:`chosen_mode` gives it; not ``disabled``.
+        mode: as returned by :func:`chosen_mode`; not ``disabled``.
         recipe: the run's settings.
-        run_dir: the run directory, in which W&B's files are.
+        run_dir: the run directory, which contains W&B's files.
         config: the full resolved configuration, with versions.
         metrics: rows so far.
         timings: their times.
-        say: told in a line what users should know.
+        say: receives lines for the user.
 
     Raises:
         RunDirectoryError: if W&B refuses the run.
@@ -202,14 +202,14 @@ class WandbTracker(Tracker):
                 dir=str(run_dir),
                 id=held.run,
                 resume="allow",
-                # The suffix: two within a second would have the same folder.
+                # Without the suffix, two within a second would share a folder.
                 settings=wandb.Settings(
                     silent=True, console="off", x_sync_dir_suffix=secrets.token_hex(3)
                 ),
             )
         except wandb.errors.Error as error:
             raise RunDirectoryError(
-                f"W&B: {message(error)}; wandb.mode=offline does without it"
+                f"W&B: {message(error)}; use wandb.mode=offline to run without it"
             ) from error
         if mode == "online":
             self._follow_server(len(metrics))
@@ -219,7 +219,7 @@ class WandbTracker(Tracker):
             self.log(row, timing)
 
     def _follow_server(self, rows: int) -> None:
-        """Where a run is logged online, the server knows what has arrived."""
+        """For a run logged online, the server knows what has arrived."""
         self._held = {}
         if self._run.resumed:
             self._next_step = max(self._next_step, int(self._run.step))
@@ -228,15 +228,15 @@ class WandbTracker(Tracker):
             self._held = {number: {} for number in range(known)}
 
     def log(self, metrics: Row, timing: Row) -> None:
-        """Log one outer iteration as one dictionary, unless W&B has it already."""
+        """Log one outer iteration as one dictionary, unless W&B already has it."""
         number = int(metrics["iteration"])
         if number in self._held:
             return
         step = max(self._next_step, number)
         try:
-            # What is not committed waits in memory for the next step, and is lost in a kill.
+            # Uncommitted data wait in memory for the next step and are lost in a kill.
             self._run.log(_values(metrics, timing), step=step, commit=True)
-        # Of a process of W&B's that has died there is no common class.
+        # The errors of a W&B process that has died have no common class.
         except Exception as error:
             if not self._failed:
                 self._say(f"W&B: {message(error) or type(error).__name__}; --resume logs the rest")
@@ -261,14 +261,14 @@ class WandbTracker(Tracker):
         if self._failed:
             return
         self._run.finish(exit_code=status)
-        # W&B's own process may write the last records a little later.
+        # W&B's own process may write the last records slightly later.
         deadline = time.monotonic() + _PATIENCE
         while file.is_file() and not has_ended(file) and time.monotonic() < deadline:
             time.sleep(0.05)
 
 
 class TensorboardTracker(Tracker):
-    """TensorBoard, by TorchRL's logger, in the folder ``tensorboard`` of the run directory.
+    """TensorBoard, through TorchRL's logger, in the folder ``tensorboard`` of the run directory.
 
     Args:
         run_dir: the run directory.
@@ -288,7 +288,7 @@ class TensorboardTracker(Tracker):
                 self.log(row, timing)
 
     def log(self, metrics: Row, timing: Row) -> None:
-        """Log one outer iteration, its number last: it says that all of it is there."""
+        """Log one outer iteration; its number comes last and marks it as complete."""
         number = int(metrics["iteration"])
         values = _values(metrics, timing)
         for name in (*(values.keys() - {"iteration"}), "iteration"):
@@ -296,7 +296,7 @@ class TensorboardTracker(Tracker):
         self._logger.experiment.flush()
 
     def evaluation(self, evaluated: Evaluated) -> None:
-        """Log the table as text and the charts as images; TensorBoard shows no films."""
+        """Log the table as text and charts as images; TensorBoard does not show films."""
         from matplotlib.image import imread
 
         writer, columns = self._logger.experiment, evaluated.columns
@@ -314,7 +314,7 @@ class TensorboardTracker(Tracker):
 
 
 def in_tensorboard(folder: Path) -> set[int]:
-    """Outer iterations that TensorBoard's files in a folder have whole."""
+    """Outer iterations that are complete in TensorBoard's files in a folder."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     if not folder.is_dir():
@@ -333,7 +333,7 @@ def trackers(
     timings: Sequence[Row],
     say: Callable[[str], object] = print,
 ) -> Iterator[list[Tracker]]:
-    """The loggers of a run, with all that they lack so far, closed in the end.
+    """The loggers of a run, brought up to date, and closed at the end.
 
     Args:
         recipe: its settings.
@@ -341,7 +341,7 @@ def trackers(
         config: the full resolved configuration, with versions.
         metrics: rows so far.
         timings: their times.
-        say: told in a line what users should know.
+        say: receives lines for the user.
     """
     opened: list[Tracker] = []
     status = 1
@@ -354,13 +354,13 @@ def trackers(
         yield opened
         status = 0
     finally:
-        with ExitStack() as closing:  # one that fails keeps none open
+        with ExitStack() as closing:  # if one fails, none stays open
             for tracker in reversed(opened):
                 closing.callback(tracker.close, status)
 
 
 def _rows(file: Path) -> list[dict[str, Any]]:
-    """A table of numbers as it was before it was written."""
+    """A table of numbers with its values parsed."""
     with file.open(newline="", encoding="utf-8") as handle:
         table = list(csv.DictReader(handle))
     return [{key: _number(text) for key, text in row.items() if text} for row in table]
@@ -383,7 +383,7 @@ def _used(recipe: RunSettings, run_dir: Path) -> list[str]:
 
 
 def lacks(recipe: RunSettings, run_dir: Path, metrics: Sequence[Row]) -> bool:
-    """Whether a logger that a run has used has not got all its rows, by the run directory."""
+    """Whether a logger that a run has used lacks rows, judging by the run directory."""
     used = _used(recipe, run_dir)
     if "wandb" in used:
         held = take_over(run_dir, metrics, lambda line: None)
@@ -400,14 +400,14 @@ def log_evaluation(
 ) -> None:
     """Log an evaluation to the loggers that the training has used, in the same run.
 
-    Nothing happens where it used none. What keeps them from it is told in a line: the tables are
-    written anyway.
+    If it used none, nothing happens. Failures are reported in one line: the tables are written
+    anyway.
 
     Args:
         recipe: the run's settings.
         run_dir: the run directory.
         evaluated: its table and pictures.
-        say: told in a line why nothing is logged.
+        say: receives a line if nothing is logged.
     """
     try:
         used = _used(recipe, run_dir)
@@ -420,7 +420,7 @@ def log_evaluation(
             if not ours:
                 say(f"{run_dir}: a process is running there, so {evaluated.name} is not logged")
                 return
-            # What they lack of the training comes first.
+            # Missing rows of the training come first.
             metrics, timings = (_rows(run_dir / f"{name}.csv") for name in ("metrics", "timing"))
             with trackers(now, run_dir, config, metrics, timings, say) as opened:
                 for tracker in opened:

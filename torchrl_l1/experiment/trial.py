@@ -1,4 +1,4 @@
-"""Trying a recipe's environment for a minute, before hours are spent in it."""
+"""Trying a recipe's environment for a minute before spending hours in it."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from torchrl_l1.envs import AnyTask, ExternalTask, Task, action_bounds, make_env
 from torchrl_l1.experiment.settings import RunSettings
 
 STEPS = 1500
-"""Real steps of random actions, about."""
+"""Approximate number of real steps with random actions."""
 
-# Steps after which the effect of an action is looked at.
+# Steps within which an action must have an effect.
 _EFFECT_STEPS = 5
 _FEWEST_EPISODES, _MOST_EPISODES = 8, 25
 
-# A reward function agrees if it explains this share of the variance of the rewards, and exactly if
-# it is that close to them, in standard deviations.
+# A reward function agrees if it explains this share of the variance of the rewards, and agrees
+# exactly if it is this close to them, in standard deviations.
 _AGREES, _EXACT = 0.95, 1e-3
 
-# Share of the variance of an entry's changes below which a model says next to nothing of it.
+# Explained share of the variance of an entry's changes below which a model is of little use.
 _POOR = 0.2
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that a trial has found.
+    """One finding of a trial.
 
     Attributes:
-        text: what.
+        text: what was found.
         fix: what to do about it; empty if nothing.
     """
 
@@ -45,12 +45,12 @@ class Finding:
     fix: str = ""
 
     def __str__(self) -> str:
-        """In a line."""
+        """The finding as one line."""
         return f"fix  {self.text}: {self.fix}" if self.fix else f"ok   {self.text}"
 
 
 def describe(task: AnyTask) -> list[str]:
-    """The facts of a task, in lines.
+    """The facts of a task, as lines.
 
     Examples:
         >>> from torchrl_l1.envs import get_task
@@ -79,15 +79,15 @@ def _numbers(bound: float | tuple[float, ...]) -> str:
 
 
 def trial(recipe: RunSettings, steps: int = STEPS) -> Iterator[Finding]:
-    """Try what a recipe is about, finding by finding.
+    """Try a recipe's environment; yields one finding at a time.
 
     Args:
         recipe: the settings.
-        steps: real steps of random actions, about.
+        steps: approximate number of real steps with random actions.
 
     Raises:
         KeyError: for an unknown task.
-        ValueError: for an environment that will not do at all.
+        ValueError: for an environment that cannot be used at all.
     """
     task = recipe.real_task()
     for line in describe(task):
@@ -100,10 +100,10 @@ def trial(recipe: RunSettings, steps: int = STEPS) -> Iterator[Finding]:
     data = _random(algorithm, count, length, recipe.seed)
     yield from _about_data(task, data, horizon)
     if not len(_flat(data)):
-        return  # as the first finding about the data says
+        return  # as the first finding about the data reports
     seeded = _about_seeds(algorithm, data, count, length, recipe.seed)
     yield seeded
-    if not seeded.fix:  # else it cannot be told
+    if not seeded.fix:  # otherwise it cannot be judged
         yield from _about_actions(task, data, recipe.seed)
     yield from _about_rewards(algorithm, data)
     yield from _about_terminations(algorithm, data)
@@ -122,7 +122,7 @@ def _about_data(task: AnyTask, data: TensorDictBase, horizon: int) -> Iterator[F
     if lost:
         yield Finding(
             f"{lost} of {data.numel()} steps gave observations or rewards that are not finite",
-            "look at the environment's step; these steps are kept out of the data",
+            "check the environment's step; these steps are left out of the data",
         )
     returns, lengths = episode_returns(data), episode_lengths(data)
     text = f"{data.numel()} random steps"
@@ -137,13 +137,14 @@ def _about_data(task: AnyTask, data: TensorDictBase, horizon: int) -> Iterator[F
     observation = data["observation"].flatten(0, 1).double()
     still = (observation.std(0) == 0).nonzero().flatten().tolist()
     if still:
-        yield Finding(f"entries {still} of the observation never change: they say nothing")
+        yield Finding(f"entries {still} of the observation never change: they carry no information")
     spread = observation.std(0)
     large = (spread > 1e4).nonzero().flatten().tolist()
     if large:
         yield Finding(
             f"entries {large} of the observation spread over more than 10 000 units",
-            "rescale them in the environment: single precision and model.std_floor mind",
+            "rescale them in the environment: they are too large for single precision and "
+            "model.std_floor",
         )
 
 
@@ -155,13 +156,13 @@ def _about_seeds(
         return Finding("the same seed gives the same episodes")
     return Finding(
         "the same seed does not give the same episodes",
-        "draw what is random in the environment from the generator that reset(seed=...) seeds, or "
-        "a resumed run will differ from an unbroken one",
+        "draw all random numbers of the environment from the generator seeded by reset(seed=...), "
+        "or a resumed run will differ from an uninterrupted one",
     )
 
 
 def _about_actions(task: AnyTask, data: TensorDictBase, seed: int) -> Iterator[Finding]:
-    """What each entry of the action does: its two bounds, from the same resets."""
+    """The effect of each entry of the action: its two bounds, from the same resets."""
     low, high = action_bounds(task)
     middle = (low + high) / 2
     changes = data["next", "observation"] - data["observation"]
@@ -180,14 +181,14 @@ def _about_actions(task: AnyTask, data: TensorDictBase, seed: int) -> Iterator[F
     if without:
         yield Finding(
             f"entries {without} of the action have no effect within {_EFFECT_STEPS} steps",
-            "L1 and planners need actions that act; leave these out of the action space",
+            "L1 and planners need actions with an effect; leave these out of the action space",
         )
     else:
         yield Finding("every entry of the action has an effect")
 
 
 def _held(task: AnyTask, action: Tensor, seed: int) -> Tensor:
-    """Observations ``(T, n)`` of one environment under one action."""
+    """Observations ``(T, n)`` of one environment under a constant action."""
     env = make_env(task, 1, seed=seed)
     state, seen = env.reset(), []
     for _ in range(_EFFECT_STEPS):
@@ -206,7 +207,7 @@ def _flat(data: TensorDictBase) -> TensorDictBase:
 
 
 def _about_rewards(algorithm: Algorithm, data: TensorDictBase) -> Iterator[Finding]:
-    """Compare the reward of imagination with that of the environment."""
+    """Compare the reward of imagined steps with that of the environment."""
     function = reward_function(algorithm)
     flat = _flat(data)
     real = flat["next", "reward"].squeeze(-1).double()
@@ -218,13 +219,13 @@ def _about_rewards(algorithm: Algorithm, data: TensorDictBase) -> Iterator[Findi
             "more random data",
         )
     if function is None:
-        yield Finding("the reward of imagination is learned from data")
+        yield Finding("the reward of imagined steps is learned from data")
         return
     with torch.no_grad():
         given = function(flat["observation"], flat["action"], flat["next", "observation"]).double()
     error = (given - real).abs()
     if float(error.max()) <= _EXACT * max(spread, float(real.abs().max()), 1e-9):
-        yield Finding("the reward function gives the environment's rewards")
+        yield Finding("the reward function reproduces the environment's rewards")
         return
     share = 1 - float((given - real).square().mean()) / max(spread**2, 1e-12)
     text = (
@@ -234,8 +235,8 @@ def _about_rewards(algorithm: Algorithm, data: TensorDictBase) -> Iterator[Findi
     worst = int(error.argmax())
     place = f"observation {_row(flat['observation'][worst])}, action {_row(flat['action'][worst])}"
     wrong = f"the environment gives {float(real[worst]):.5g} and the function "
-    wrong += f"{float(given[worst]):.5g} at {place}; correct it, or say reward=learned"
-    # A task of ours may be imagined otherwise on purpose, as its authors did.
+    wrong += f"{float(given[worst]):.5g} at {place}; correct it, or set reward=learned"
+    # A built-in task may be imagined differently on purpose, as its authors did.
     agrees = share >= _AGREES or isinstance(algorithm.task, Task)
     yield Finding(text, "" if agrees else wrong)
 
@@ -264,9 +265,9 @@ def _about_terminations(algorithm: Algorithm, data: TensorDictBase) -> Iterator[
     yield Finding(
         f"termination: {missed} of {count} are missed, and {false} of {len(ended) - count} other "
         "steps are called terminal",
-        "correct the function, or say termination=learned"
+        "correct the function, or set termination=learned"
         if function is not None
-        else "imagination never ends: say termination=learned, or give a function",
+        else "imagined episodes never end: set termination=learned, or give a function",
     )
 
 
@@ -283,7 +284,7 @@ def _about_model(data: TensorDictBase, recipe: RunSettings) -> Iterator[Finding]
             max_epochs=60,
             max_gradient_steps=1500,
         )
-    # Of what else the fit says the words are below.
+    # Other warnings of the fit are covered by the findings below.
     for words in (str(one.message) for one in told if "std_floor" in str(one.message)):
         text, _, fix = words.partition(": ")
         yield Finding(text, fix.replace("a std_floor of ", "model.std_floor="))
@@ -301,23 +302,23 @@ def _about_model(data: TensorDictBase, recipe: RunSettings) -> Iterator[Finding]
     if poor:
         fix = (
             f"entries {poor} are hardly predicted: they jump, or depend on what is not observed; "
-            "leave them out (observation_keys), or expect more from more data"
+            "leave them out (observation_keys), or collect more data"
         )
     yield Finding(text, fix)
 
 
 def reward_function(algorithm: Algorithm) -> Any:
-    """The reward of imagination; ``None`` where it is learned."""
+    """The reward function of imagined steps; ``None`` if it is learned."""
     learned = "reward_model" in algorithm.outcomes.models
     return None if learned else algorithm.outcomes.reward
 
 
 def termination_function(algorithm: Algorithm) -> tuple[bool, Any]:
-    """Whether the termination of imagination is known, and the function, if there is one."""
+    """Whether the termination of imagined steps is known, and the function, if there is one."""
     outcomes = algorithm.outcomes
     return not outcomes.learns_terminations, outcomes.termination()
 
 
 def failures(findings: Sequence[Finding]) -> int:
-    """How many ask for something to be done."""
+    """Number of findings with something to fix."""
     return sum(bool(finding.fix) for finding in findings)

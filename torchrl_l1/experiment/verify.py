@@ -60,7 +60,7 @@ def _load(path: Path) -> dict[str, dict[str, np.ndarray]]:
         raise FileNotFoundError(f"no trace file at {path}")
     try:
         archive = np.load(path)
-    # What zipfile and NumPy raise of a damaged file has no common class.
+    # The errors of zipfile and NumPy for a damaged file have no common class.
     except Exception as error:
         raise ValueError(f"{path} is not a NumPy .npz file: {error}") from error
     if not isinstance(archive, np.lib.npyio.NpzFile):
@@ -71,7 +71,7 @@ def _load(path: Path) -> dict[str, dict[str, np.ndarray]]:
             prefix, separator, field = key.rpartition("/")
             if separator and prefix.count("/") == 1:
                 try:
-                    # Of a part that is no array NumPy gives the bytes.
+                    # For a part that is not an array, NumPy returns bytes.
                     traces.setdefault(prefix, {})[field] = np.asarray(archive[key])
                 except Exception as error:
                     raise ValueError(f"{path}: cannot read {key}: {error}") from error
@@ -104,7 +104,7 @@ def _largest_error(name: str, trace: Mapping[str, np.ndarray]) -> float:
         ]
         if "sigma_um" in fields:
             pairs.append((diagnostics.unmatched, fields["sigma_um"][t].norm().reshape(1)))
-        # A deviation that is not a number must not pass for a small one.
+        # A NaN deviation must not pass for a small one.
         error = max(
             error,
             *(float((ours - theirs).abs().max().nan_to_num(torch.inf)) for ours, theirs in pairs),
@@ -146,11 +146,11 @@ def _checked(name: str, trace: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
     try:
         return {field: torch.as_tensor(trace[field].astype(np.float64)) for field in shapes}
     except (TypeError, ValueError) as error:
-        raise ValueError(f"trace {name!r} holds values that are no numbers: {error}") from error
+        raise ValueError(f"trace {name!r} holds values that are not numbers: {error}") from error
 
 
 def verify_command(path: str, tolerance: float) -> bool:
-    """``torchrl-l1 verify``: print the largest error per trace; whether all are within bounds."""
+    """``torchrl-l1 verify``: print the largest error per trace; returns whether all are within."""
     results = verify_traces(path)
     width = max(len(name) for name, _ in results)
     for name, error in results:

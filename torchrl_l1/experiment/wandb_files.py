@@ -1,12 +1,12 @@
-"""W&B's own files of a run: what they hold, and mended where a kill has cut them.
+"""W&B's own files of a run: reading them, and repairing those truncated by a kill.
 
 ``wandb sync`` reads the files of a run one after the other. It stops at the first that it cannot
-read to its end, takes up none that does not say which run it is of, and gives a new number to a
-step that is not behind the one before. So what a kill has left is cut to its last whole record,
-and a run that goes on logs what the files together lack, and nothing else.
+read to the end, skips files that do not name their run, and renumbers a step that does not follow
+the one before. So files left by a kill are cut to their last complete record, and a run that
+continues logs exactly what the files together lack.
 
-The format is that of LevelDB's log: blocks of 32 KiB, each part of a record after its checksum,
-length and kind; a header of W&B's own; records are protocol buffers.
+The format is that of LevelDB's log, with W&B's own header: blocks of 32 KiB, in which each part of
+a record follows its checksum, length and kind; records are protocol buffers.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import Any
 from torchrl_l1.experiment.files import read_text, refuse_link, write_atomically
 
 ID_FILE = "wandb_id.txt"
-"""Where a run directory keeps the id that W&B knows the run by."""
+"""File in a run directory with the run's id at W&B."""
 
 _BLOCK, _HEAD = 32_768, 7
 _WHOLE, _FIRST, _MIDDLE, _LAST = 1, 2, 3, 4
@@ -35,7 +35,7 @@ _FOLDER = re.compile(r"(?:offline-)?run-\d{8}_\d{6}-(\w+)(?:-\w+)?")
 def known_id(run_dir: Path) -> str | None:
     """The id of a run at W&B, or ``None`` if it has none yet.
 
-    A run that is older than the file keeps that which its folders of W&B's are named by.
+    A run older than the file keeps the id in the names of its W&B folders.
     """
     try:
         text = read_text(run_dir / ID_FILE, 1000).strip()
@@ -51,14 +51,14 @@ def known_id(run_dir: Path) -> str | None:
 
 
 def draw_id(run_dir: Path) -> str:
-    """Give a run an id that no other has, and keep it in the run directory."""
+    """Give a run a unique id and store it in the run directory."""
     drawn = secrets.token_hex(6)
     write_atomically(run_dir / ID_FILE, drawn + "\n")
     return drawn
 
 
 def whole_records(content: bytes) -> Iterator[tuple[bytes, int]]:
-    """The records of a file and where each ends, up to the first that is not as it was written."""
+    """The records of a file and where each ends, up to the first damaged one."""
     if content[:4] != b":W&B":
         return
     position = _HEAD
@@ -89,14 +89,14 @@ def whole_records(content: bytes) -> Iterator[tuple[bytes, int]]:
 
 @dataclass
 class WandbFile:
-    """One of the files that W&B has written of a run.
+    """One of the files that W&B has written for a run.
 
     Attributes:
-        path: where it is.
-        start: when it was begun, seconds; ``None`` if it does not say which run it is of.
-        ended: whether that was in order.
-        end: bytes up to the end of the last whole record.
-        history: what was logged, each with its ``_step``.
+        path: its path.
+        start: time at which it was begun, in seconds; ``None`` if it does not name its run.
+        ended: whether it was ended properly.
+        end: number of bytes up to the end of the last complete record.
+        history: the logged entries, each with its ``_step``.
     """
 
     path: Path
@@ -129,7 +129,7 @@ def _read(path: Path) -> WandbFile:
 
 
 def has_ended(path: Path) -> bool:
-    """Whether a file has all that W&B will write."""
+    """Whether W&B has finished writing a file."""
     return _read(path).ended
 
 
@@ -145,12 +145,12 @@ def _files(run_dir: Path, run: str) -> list[Path]:
 
 @dataclass
 class Held:
-    """What W&B's files of a run hold together.
+    """The joint contents of W&B's files of a run.
 
     Attributes:
-        run: the id under which the run goes on.
-        rows: rows of the metrics, by outer iteration.
-        next_step: the first step that none of them has.
+        run: the id under which the run continues.
+        rows: rows of the metrics by outer iteration.
+        next_step: the first step after all of theirs.
     """
 
     run: str
@@ -161,16 +161,17 @@ class Held:
 def take_over(
     run_dir: Path, metrics: Sequence[Mapping[str, Any]], say: Callable[[str], object]
 ) -> Held:
-    """Mend the files of a run and say what they hold.
+    """Repair the files of a run and return their contents.
 
-    A file without an end is cut to its last whole record and replaced, so that a process of W&B's
-    that has outlived a kill writes to it no more. One that says nothing of the run is removed.
-    Files that contradict the metrics or have gaps are set aside, and the run gets another id.
+    A file without a proper end is cut to its last complete record and replaced, so that a W&B
+    process that has outlived a kill no longer writes to it. One that does not name its run is
+    removed. Files that contradict the metrics or have gaps are set aside, and the run gets another
+    id.
 
     Args:
-        run_dir: the run directory, which is ours.
+        run_dir: the run directory, held by this process.
         metrics: its rows so far.
-        say: told in a line what has become of files that are of no use.
+        say: receives a line if files are set aside.
     """
     refuse_link(run_dir / "wandb")
     run = known_id(run_dir)
@@ -190,8 +191,8 @@ def take_over(
             folder = file.path.parent
             folder.rename(folder.with_name(f"set-aside-{folder.name}"))
         say(
-            f"{run_dir / 'wandb'}: its files are not of the run as it is in metrics.csv; they are "
-            "set aside, and W&B gets it anew"
+            f"{run_dir / 'wandb'}: its files do not match the run's metrics.csv; they are set "
+            "aside, and the run is logged to W&B again"
         )
         return Held(draw_id(run_dir))
     if not (run_dir / ID_FILE).exists():
@@ -199,20 +200,20 @@ def take_over(
     for file in files:
         content = file.path.read_bytes()
         if not file.ended or file.end < len(content):
-            # An end that has come meanwhile is cut off: nothing of the history is behind it.
+            # An end written meanwhile is cut off: no history follows it.
             write_atomically(file.path, content[: file.end])
     return held
 
 
 def _collect(files: Sequence[WandbFile], metrics: Sequence[Mapping[str, Any]], held: Held) -> bool:
-    """Put together what files hold, in their order; false if it contradicts the metrics."""
+    """Join the contents of files in their order; false if they contradict the metrics."""
     for row in (row for file in files for row in file.history):
         held.next_step = max(held.next_step, int(row["_step"]) + 1)
         if "iteration" not in row:
             continue
         number = row["iteration"]
         if number == len(held.rows) - 1 and _same(row, held.rows[number]):
-            continue  # as older versions logged it again when they went on
+            continue  # older versions logged it again when a run continued
         if number != len(held.rows):
             return False
         if number < len(metrics) and not _same(metrics[number], row):
@@ -222,7 +223,7 @@ def _collect(files: Sequence[WandbFile], metrics: Sequence[Mapping[str, Any]], h
 
 
 def _same(row: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether two rows have the same metrics; times differ when an iteration is made again."""
+    """Whether two rows have the same metrics; times differ if an iteration is repeated."""
     return all(
         key in other and _equal(value, other[key])
         for key, value in row.items()

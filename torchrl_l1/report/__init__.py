@@ -1,4 +1,4 @@
-"""Reports: the paper's tables and curves, ours beside the published ones."""
+"""Reports: the paper's tables and curves, with measured results beside the published ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From run directories to a report."""
+"""Building a report from run directories."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from torchrl_l1.report.training import run_rows, training_sections
 
 
 def report_command(options: argparse.Namespace) -> None:
-    """Write the report and say where it is."""
-    # The packages stay. Without them what figures leave behind is soon much, and is collected.
+    """Write the report and print its path."""
+    # Imported packages stay. With them frozen, what figures leave soon dominates and is collected.
     gc.freeze()
     gc.collect()
     page = report(
@@ -45,18 +45,18 @@ def report_command(options: argparse.Namespace) -> None:
 def report(
     folders: Sequence[Path], output: Path | None = None, reference_curves: Path | None = None
 ) -> Path:
-    """Write tables, figures and a page of all runs in or below some folders.
+    """Write tables, figures and a page on all runs in some folders and their subfolders.
 
-    Each algorithm has sections of its own. Where there are several, their headings and files are
-    named after it, and a last section compares them.
+    Each algorithm has its own sections. If there are several, headings and files are named after
+    the algorithm, and a last section compares them.
 
-    Everything is read before anything is written. Files that cannot be read are left out, and
-    the page lists them.
+    Everything is read before anything is written. Unreadable files are left out and listed on the
+    page.
 
     Args:
-        folders: where to look.
-        output: folder of the results; ``report`` in the first folder by default.
-        reference_curves: learning curves to draw behind, see :class:`ReferenceCurves`.
+        folders: the folders to search.
+        output: folder for the results; ``report`` in the first folder by default.
+        reference_curves: learning curves to draw in the background, see :class:`ReferenceCurves`.
 
     Returns:
         the page, ``report.md``.
@@ -110,8 +110,8 @@ def _introduction(page: Page, every: Sequence[Study], found: Findings, command: 
     if duplicates:
         left_out = "\n".join(f"- {plain(run.path)}" for run in duplicates)
         page.text(
-            "Left out, since another run has the same settings and seed (what it was evaluated in "
-            f"and the other was not counts for the other):\n\n{left_out}"
+            "Left out, since another run has the same settings and seed (evaluations that only the "
+            f"left-out run has are counted for the other):\n\n{left_out}"
         )
     diverged = "\n".join(f"- {plain(r.path)}: {plain(r.diverged)}" for r in runs if r.diverged)
     if diverged:
@@ -122,14 +122,14 @@ def _introduction(page: Page, every: Sequence[Study], found: Findings, command: 
 
 
 def _algorithms(every: Sequence[Study]) -> str:
-    """Which algorithms there are; nothing to say where it is METRPO alone."""
+    """A sentence on the algorithms; empty if METRPO is the only one."""
     if len(every) == 1:
         (study,) = every
         return "" if study.algorithm == "metrpo" else f"The algorithm is {study.facts.name}."
     numbers = ", ".join(f"{study.facts.name} ({len(study.runs)} runs)" for study in every)
     return (
-        f"Algorithms: {numbers}. Their runs are never pooled: each has sections of its own, with "
-        "its name in the headings, and tables and figures are named after it."
+        f"Algorithms: {numbers}. Their runs are never pooled: each has its own sections, with "
+        "its name in the headings, and its tables and figures are named after it."
     )
 
 
@@ -150,15 +150,15 @@ def _command(folders: Sequence[Path], output: Path, reference_curves: Path | Non
 
 @dataclass(frozen=True)
 class CampaignState:
-    """A campaign and how far it is.
+    """A campaign and its progress.
 
     Attributes:
         name: its name.
         description: one line.
-        command: what makes it, or makes it complete.
+        command: the command that makes or completes it.
         expected: number of runs that it asks for.
-        finished: number of finished ones.
-        begun: number of those that are not finished.
+        finished: number of finished runs.
+        begun: number of runs begun but not finished.
         others: number of runs in its folder that it does not ask for.
     """
 
@@ -174,12 +174,12 @@ class CampaignState:
 def find_campaigns(
     folders: Sequence[Path], runs: Sequence[Run], errors: list[RunDirectoryError]
 ) -> list[CampaignState]:
-    """Every ``campaign.yaml`` in or below some folders.
+    """Every ``campaign.yaml`` in some folders and their subfolders.
 
     Args:
-        folders: where to look.
-        runs: those that there are.
-        errors: what is wrong with those that are no campaign file joins these.
+        folders: the folders to search.
+        runs: the runs found.
+        errors: problems with invalid campaign files are appended to these.
     """
     found: dict[Path, CampaignState] = {}
     for folder in folders:
@@ -204,10 +204,10 @@ def _read_campaign(folder: Path, runs: Sequence[Run]) -> CampaignState:
             for entry in content["runs"]
         ]
     except (AttributeError, IndexError, KeyError, TypeError, CampaignError) as error:
-        raise ValueError(f"{file} is no campaign file: {error!r}") from error
+        raise ValueError(f"{file} is not a campaign file: {error!r}") from error
     given: str | Path = file
     if name in available_campaigns():
-        # The file in the folder has the overrides of its command; the shipped one has none.
+        # The file in the folder includes the overrides of its command; the shipped one does not.
         same = read_campaign(name).to_dict()["runs"] == content["runs"]
         given = name if same else file
     below = [run for run in runs if _campaign_of(run.path.resolve()) == folder.resolve()]
@@ -228,14 +228,14 @@ def _read_campaign(folder: Path, runs: Sequence[Run]) -> CampaignState:
 
 
 def _is_one_of(place: Sequence[str], asked: Sequence[Sequence[Sequence[str]]]) -> bool:
-    """Whether a path is in a matrix of these; all paths of one may be more than memory holds."""
+    """Whether a path belongs to one of these matrices; all paths might not fit into memory."""
     return any(
         len(place) == len(names) and all(map(operator.contains, names, place)) for names in asked
     )
 
 
 def _campaign_of(run: Path) -> Path | None:
-    """The folder of the campaign that a run is of: the next above it with a ``campaign.yaml``."""
+    """The folder of a run's campaign: the nearest one above it with a ``campaign.yaml``."""
     return next((above for above in run.parents if (above / "campaign.yaml").is_file()), None)
 
 
@@ -244,13 +244,13 @@ def _one_line(command: str) -> str:
 
 
 def _campaigns(page: Page, campaigns: Sequence[CampaignState]) -> None:
-    """How far each campaign is, and the command behind it."""
+    """The progress of each campaign, and its command."""
     for campaign in campaigns:
         left = campaign.expected - campaign.finished - campaign.begun
         state = f"{campaign.finished} of {campaign.expected} runs finished"
         state += f", {campaign.begun} unfinished" * (campaign.begun > 0)
         state += f", {left} not begun" * (left > 0)
-        state += f", {campaign.others} here that it does not ask for" * (campaign.others > 0)
+        state += f", {campaign.others} others in its folder" * (campaign.others > 0)
         page.text(
             f"Campaign **{plain(campaign.name)}** ({state}). {plain(campaign.description)}".strip(),
             f"```console\n$ {_one_line(campaign.command)}\n```",
@@ -258,8 +258,8 @@ def _campaigns(page: Page, campaigns: Sequence[CampaignState]) -> None:
 
 
 def _versions(page: Page, runs: Sequence[Run]) -> None:
-    """What the runs ran with, a line per package and version."""
-    page.heading("Versions", "What the runs ran with, from their `versions.json`.")
+    """Versions used by the runs, a line per package and version."""
+    page.heading("Versions", "Versions that the runs used, from their `versions.json`.")
     seen: dict[tuple[str, str], int] = {}
     for run in runs:
         for package, version in run.versions.items():

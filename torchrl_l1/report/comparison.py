@@ -1,4 +1,4 @@
-"""The algorithms side by side, where several learned the same task with the same noise."""
+"""Comparison of algorithms that learned the same task with the same noise."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from torchrl_l1.report.study import Cell, Study, noise_order
 from torchrl_l1.report.style import algorithm_label, arm_style, title
 from torchrl_l1.report.training import training_row
 
-# Of a row of the training, what can be compared.
+# The columns of a training row that can be compared.
 _KEYS = (
     "seeds",
     "return_mean",
@@ -36,15 +36,15 @@ _KEYS = (
 
 
 def algorithm_sections(page: Page, studies: Sequence[Study]) -> None:
-    """Curves, returns and differences where several algorithms learned the same task and noise."""
+    """Curves, returns and differences of algorithms that learned the same task and noise."""
     places = compared_places(studies)
     if not places:
         return
     page.heading(
         "Algorithms",
         "The main runs of the algorithms that learned the same task with the same noise: return by "
-        "the same rule, each after the real steps of its own training. In the figures the colour "
-        "is the algorithm's, a dashed line is without L1; thin: single seeds; bold: their mean.",
+        "the same rule, each after the real steps of its own training. In the figures, colours "
+        "mark the algorithm; dashed lines: without L1; thin: single seeds; bold: their mean.",
     )
     rows = algorithm_rows(studies)
     page.text(algorithm_table(rows))
@@ -73,11 +73,11 @@ def _settings(studies: Sequence[Study], tasks: Sequence[str]) -> str:
             lines.append(f"- {task}: {'; '.join(differing)}")
     if not lines:
         return ""
-    return "Settings that several have and that differ:\n\n" + "\n".join(lines)
+    return "Settings that several of them have and that differ:\n\n" + "\n".join(lines)
 
 
 def compared_places(studies: Sequence[Study]) -> dict[str, list[str]]:
-    """Noises by task in which several algorithms have main cells."""
+    """Noises by task for which several algorithms have main cells."""
     found: dict[tuple[str, str], set[str]] = {}
     for study in studies:
         for cell in study.cells:
@@ -109,7 +109,7 @@ def algorithm_rows(studies: Sequence[Study]) -> list[dict[str, Any]]:
 
 
 def algorithm_pairs(studies: Sequence[Study]) -> list[dict[str, Any]]:
-    """What an algorithm reaches, less what one before it does, over the seeds that both have.
+    """The return of an algorithm less that of an earlier one, over the seeds that both have.
 
     Each L1 setting is compared with the other algorithm without L1 and with the same setting.
     """
@@ -132,7 +132,7 @@ def algorithm_pairs(studies: Sequence[Study]) -> list[dict[str, Any]]:
 
 
 def differing_settings(studies: Sequence[Study], task: str) -> dict[str, dict[str, str]]:
-    """Settings that several algorithms have and that differ: their values by algorithm.
+    """Settings that several algorithms share but that differ: their values by algorithm.
 
     Settings of the controller are compared between cells of the same L1 setting.
     """
@@ -149,7 +149,7 @@ def differing_settings(studies: Sequence[Study], task: str) -> dict[str, dict[st
                 found.setdefault((cell.arm, key), {})[label] = value
     differing: dict[str, dict[str, str]] = {}
     for (_, key), values in found.items():
-        # What the algorithm is called is no setting.
+        # The name of the algorithm is not a setting.
         if key not in ("algorithm", "recipe") and len(set(values.values())) > 1:
             differing.setdefault(key, {}).update(values)
     return differing
@@ -220,9 +220,9 @@ def algorithm_pairs_table(rows: Sequence[Row]) -> str:
 def plot_algorithms(
     studies: Sequence[Study], task: str, noises: Sequence[str], file: Path
 ) -> Path | None:
-    """The main cells of all algorithms on a task, a panel per noise.
+    """The main cells of all algorithms on a task, one panel per noise.
 
-    The colour is that of the algorithm, the style of a line that of the L1 setting.
+    Colours mark the algorithm, line styles the L1 setting.
 
     Returns:
         the file, or ``None`` if no run has finished an iteration.

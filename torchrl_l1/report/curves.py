@@ -1,4 +1,4 @@
-"""Return against real steps: the learning curves of a task, and the panels of all such figures."""
+"""Return against real steps: learning curves of a task, and the panels of all such figures."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ from torchrl_l1.report.style import (
     title,
 )
 
-# Trainings that differ more in length are drawn over a logarithmic axis.
+# Trainings whose lengths differ more are drawn over a logarithmic axis.
 _MOST_TIMES = 5
 
 _SHADES = ("0.82", "0.91")
 
 
 def curve_section(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
-    """A figure per task.
+    """Add a section with a figure per task.
 
     Args:
-        page: where to.
+        page: the page.
         study: the runs.
-        reference: curves to draw behind.
+        reference: curves to draw in the background.
     """
     page.heading(
         "Learning curves",
         "Thin: single seeds; bold: their mean"
         + _dashed(study)
-        + "; grey: mean of the authors' logs, where they were given, cut where ours end"
+        + "; grey: mean of the authors' logs, if given, cut at the end of ours"
         * study.facts.reference_logs
         + _bands(study)
         + ".",
@@ -58,7 +58,7 @@ def curve_section(page: Page, study: Study, reference: ReferenceCurves | None) -
 
 
 def curve_rows(study: Study) -> list[dict[str, Any]]:
-    """One row per run and outer iteration, unfinished runs included: what the figures draw."""
+    """The data of the figures: one row per run and outer iteration, including unfinished runs."""
     rows = []
     for cell, runs in study.cells.items():
         for run in runs:
@@ -78,7 +78,7 @@ def curve_rows(study: Study) -> list[dict[str, Any]]:
 
 
 def _digits(value: float) -> float:
-    """As many as a sum of 32-bit rewards has."""
+    """Round to the significant digits of a sum of 32-bit rewards."""
     return float(f"{value:.8g}")
 
 
@@ -103,14 +103,14 @@ def plot_task(
     reference: ReferenceCurves | None = None,
     name: str = "",
 ) -> Path | None:
-    """The main cells of a task, a panel per noise.
+    """The main cells of a task, one panel per noise.
 
     Args:
         study: the runs.
         task: the task.
-        file: where to.
-        reference: curves to draw behind.
-        name: of the algorithm, where there are several.
+        file: the file to write.
+        reference: curves to draw in the background.
+        name: name of the algorithm, if there are several.
 
     Returns:
         the file, or ``None`` if no run has finished an iteration.
@@ -137,7 +137,7 @@ def _authors(reference: ReferenceCurves | None, task: str, noise: str) -> list[G
 
 
 def main_lines(study: Study, task: str) -> Iterator[tuple[str, list[Line]]]:
-    """A line for each main cell of a task, by noise."""
+    """Lines of the main cells of a task, by noise."""
     cells = [cell for cell in study.cells if cell.task == task and not cell.variant]
     for noise in dict.fromkeys(cell.noise for cell in cells):
         chosen = [cell for cell in cells if cell.noise == noise]
@@ -155,7 +155,7 @@ def cell_line(study: Study, cell: Cell, label: str, look: Look) -> Line:
 
 
 def stage_bands(study: Study, lines: Sequence[Line]) -> list[Band]:
-    """Where the stages are, in the run that is furthest; none where there is one stage only."""
+    """The stages of the run that has got furthest; none if there is only one stage."""
     furthest = max((run for line in lines for run in line.runs), key=lambda run: len(run.returns))
     bands: list[Band] = []
     for position, stage in enumerate(study.facts.named_stages):
@@ -170,12 +170,12 @@ class Line:
     """One cell in a panel.
 
     Attributes:
-        label: in the legend.
-        color: of its curves.
+        label: its label in the legend.
+        color: colour of its curves.
         runs: its runs.
-        mean_action: places of the stages, see :meth:`Run.during`, in which the return with the mean
-            action is a curve of its own.
-        style: of its curves, as matplotlib takes it.
+        mean_action: positions of the stages, see :meth:`Run.during`, in which the return with the
+            mean action has its own curve.
+        style: matplotlib line style of its curves.
     """
 
     label: str
@@ -192,7 +192,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Grey:
-    """Curves of the authors in a panel."""
+    """The authors' curves in a panel."""
 
     label: str
     style: str
@@ -210,14 +210,14 @@ class Band:
 
 @dataclass(frozen=True)
 class Panel:
-    """What is drawn in the same axes.
+    """The contents of one set of axes.
 
     Attributes:
         heading: title of the panel.
         lines: our curves.
         authors: curves behind them.
-        bands: parts of the training to be shaded.
-        stage: position of the stage that is drawn, see :meth:`Run.during`; all of them if ``None``.
+        bands: parts of the training to shade.
+        stage: position of the stage to draw, see :meth:`Run.during`; all stages if ``None``.
     """
 
     heading: str
@@ -227,19 +227,19 @@ class Panel:
     stage: int | None = None
 
     def begun(self) -> Panel:
-        """The panel with those lines only that have something to draw."""
+        """The panel with only those lines that have something to draw."""
         lines = [line for line in self.lines if any(len(run.returns) for run in line.runs)]
         return replace(self, lines=lines)
 
     @property
     def offline(self) -> bool:
-        """Whether all algorithms in it learn from data that stay the same."""
+        """Whether all its algorithms learn from fixed data."""
         return all(
             facts(run.identity.algorithm).offline for line in self.lines for run in line.runs
         )
 
     def along(self, run: Run) -> np.ndarray:
-        """What a run is drawn over `(T,)`: thousands of real steps, or outer iterations."""
+        """Abscissa `(T,)` of a run: thousands of real steps, or outer iterations."""
         return np.arange(len(run.returns)) + 1.0 if self.offline else run.real_steps / 1000
 
     def part(self, run: Run) -> np.ndarray:
@@ -249,11 +249,11 @@ class Panel:
 
 
 def plot_panels(panels: Sequence[Panel], file: Path, same_scale: bool = False) -> Path | None:
-    """A figure of some panels with one legend.
+    """A figure of several panels with one legend.
 
     Args:
         panels: the panels.
-        file: where to.
+        file: the file to write.
         same_scale: whether all show the same range of returns.
 
     Returns:
@@ -278,13 +278,13 @@ def plot_panels(panels: Sequence[Panel], file: Path, same_scale: bool = False) -
 
 
 def _draw(axis: Axes, panel: Panel) -> list[np.ndarray]:
-    """Draw a panel; returns the values that are in sight."""
+    """Draw a panel; returns the visible values."""
     shown = []
     ends = [
         max(panel.along(run)[-1] for run in line.runs if len(run.returns)) for line in panel.lines
     ]
     end = max(ends)
-    # What is still short because it has just begun is no reason for another axis.
+    # Runs that are short only because they have just begun do not change the axis.
     whole = [
         own
         for own, line in zip(ends, panel.lines, strict=True)
@@ -303,7 +303,7 @@ def _draw(axis: Axes, panel: Panel) -> list[np.ndarray]:
             if not run.finished:
                 axis.plot([], [], ":", color="0.2", linewidth=0.8, label="unfinished run")
         done = [run for run in line.runs if run.finished]
-        if not done:  # no mean, whose entry in the legend would say what the colour is
+        if not done:  # there is no mean, whose legend entry would explain the colour
             _line(axis, steps[:0], values[:0], line.style, line.color, 2.2, label=line.label)
         if done:
             steps, means = np.mean(
@@ -344,7 +344,7 @@ def _draw(axis: Axes, panel: Panel) -> list[np.ndarray]:
 
 
 def _dots(steps: np.ndarray) -> str:
-    """A single point makes no line."""
+    """A marker for a single point, which makes no line."""
     return "o" if len(steps) == 1 else ""
 
 

@@ -1,4 +1,4 @@
-"""Ablation bars, returns against disturbances, and sweeps of the controller's values."""
+"""Figures of evaluations: ablation, returns against disturbances, sweeps of controller values."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ from torchrl_l1.report.style import (
 )
 
 L1_IN = ("neither", "training only", "testing only", "both")
-"""Where L1 is on, in the order in which tables and figures show it."""
+"""Phases with L1 on, in the order of tables and figures."""
 
 _AXES = {
     "epsilon": "switching tolerance epsilon (raw state units)",
     "alpha": "filter gain alpha per step",
 }
-# The first colour is that of the line without L1.
+# The first colour is for the line without L1.
 _COLORS = 6
 # Panels of disturbances side by side.
 _MOST_ACROSS = 4
 _MARKERS = "osD^vP"
-# Lines over others let those show through, as where two controllers are as good.
+# Lines are translucent, so that overlapping ones of equally good controllers show.
 _OVER: Sequence[Any] = ("-", "-", (0, (4, 3)), (0, (1, 3)))
 
 
 def plot_ablation(rows: Sequence[Row], file: Path, name: str = "") -> Path:
-    """Bars of return with L1 in neither phase, one of them, or both; a panel per task.
+    """Bars of the return with L1 in neither phase, one of them, or both; one panel per task.
 
     Args:
-        rows: of :func:`~torchrl_l1.report.evaluations.ablation_rows`, of one kind of policy,
+        rows: rows of :func:`~torchrl_l1.report.evaluations.ablation_rows`, of one kind of policy,
             one kind of L1, one variant and one stage.
-        file: where to.
-        name: of the algorithm, where there are several.
+        file: the file to write.
+        name: name of the algorithm, if there are several.
     """
     tasks = list(dict.fromkeys(row["task"] for row in rows))
     figure, axes = grid(len(tasks), columns=2, width=6.2, height=3.6)
@@ -96,10 +96,10 @@ class Columns:
     """What a chart shows against a disturbance: columns of rows, as a line within a band.
 
     Attributes:
-        line: the values.
-        low: lower limits of the band, as far as there are any.
-        high: upper ones.
-        words: at the axis.
+        line: column of the values.
+        low: column of the lower limits of the band, where known.
+        high: column of the upper limits.
+        words: label of the axis.
     """
 
     line: str
@@ -131,18 +131,18 @@ def plot_disturbances(
     """Return against each disturbance, one line per controller.
 
     There is a panel per stage, policy, noise and disturbance for each of ``shown``, one below the
-    other, with its line and band. Returns of training seeds differ more from each other than L1
-    off from L1 on, so by default the difference, policy by policy, stands below each return. Of
-    many disturbances only those that are tested at several magnitudes have panels.
+    other, with its line and band. Returns differ more between training seeds than between L1 off
+    and on, so by default the difference, policy by policy, is shown below each return. If there are
+    many disturbances, only those tested at several magnitudes have panels.
 
     Args:
-        rows: tested under several values of disturbances; in a report, of one cell and stage of
+        rows: tests under several values of disturbances; in a report, of one cell and stage of
             the training.
         heading: title of the figure.
-        file: where to.
-        algorithm: what the policies are of.
-        shown: what the panels show, the first being returns.
-        always: whether to draw the first disturbance where none varies.
+        file: the file to write.
+        algorithm: the algorithm of the policies.
+        shown: what the panels show, beginning with returns.
+        always: whether to draw the first disturbance if none varies.
 
     Returns:
         the file, or ``None`` if there is nothing to draw.
@@ -159,8 +159,8 @@ def plot_disturbances(
         found += [(name, what, chosen) for what, chosen in varied.items()]
     if not found:
         return None
-    # Returns and differences take turns down the rows. A single disturbance with nothing below it
-    # has room for two beside each other.
+    # Returns and differences alternate down the rows. A single disturbance with nothing below it
+    # leaves room for two panels side by side.
     columns = min(max(len({what for _, what, _ in found}), 2 // len(shown)), _MOST_ACROSS)
     panels: list[tuple[str, str, list[Row], Columns] | None] = []
     for group in (found[i : i + columns] for i in range(0, len(found), columns)):
@@ -191,11 +191,11 @@ def plot_disturbances(
 
 
 def _varied(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """By name of a disturbance that varies, the rows in which all others are neutral."""
+    """For each disturbance that varies, the rows in which all others are neutral."""
     found = {}
     for what, entry in DISTURBANCES.items():
         chosen = [row for row in rows if disturbed(row).keys() <= {what}]
-        # Tables that are older than a disturbance have no column of it.
+        # Tables older than a disturbance have no column for it.
         if len({row.get(what, entry.neutral) for row in chosen}) > 1:
             found[what] = chosen
     return found
@@ -224,7 +224,7 @@ def _draw_disturbance(
             axis.fill_between(
                 [row[what] for row in limits], low, high, color=shade, alpha=0.18, linewidth=0
             )
-            # Not the upper limit: it may lie beyond what a return can be.
+            # Not the upper limit: it may exceed the best possible return.
             shown.append(low)
     disturbance = DISTURBANCES[what]
     axis.set_xlabel(f"{disturbance.words} ({disturbance.units})")
@@ -240,12 +240,12 @@ def _values(row: Row) -> list[float]:
 
 
 def tuning_rows(rows: Sequence[Row]) -> tuple[str, list[Row]]:
-    """The kind of policy that a figure shows, and its rows: sampled actions where there are any.
+    """The kind of policy that a figure shows, and its rows: sampled actions if there are any.
 
     Training samples its actions, and the mean action alone hardly moves the operating point.
 
     Args:
-        rows: of one cell of the training.
+        rows: rows of one cell of the training.
     """
     tuned = {row["policy"] for row in rows if "option" in row}
     policy = "deterministic" if tuned == {"deterministic"} else "stochastic"
@@ -255,15 +255,14 @@ def tuning_rows(rows: Sequence[Row]) -> tuple[str, list[Row]]:
 def plot_tuning(rows: Sequence[Row], heading: str, file: Path) -> Path | None:
     """Switches per 1000 steps and returns against epsilon, one line per alpha.
 
-    The panel of the switches is that of the first condition, the least disturbed one; then each
+    The first panel shows the switches under the first, least disturbed condition; then each
     condition has a panel with its returns: means over training seeds, their 95 % intervals as
-    bars, and the return without L1 as a dashed line. If only alpha varies, it takes the place of
-    epsilon.
+    bars, and the return without L1 as a dashed line. If only alpha varies, it replaces epsilon.
 
     Args:
-        rows: of :func:`tuning_rows`.
+        rows: rows of :func:`tuning_rows`.
         heading: title of the figure.
-        file: where to.
+        file: the file to write.
 
     Returns:
         the file, or ``None`` if neither epsilon nor alpha varies.
@@ -297,7 +296,7 @@ def plot_tuning(rows: Sequence[Row], heading: str, file: Path) -> Path | None:
                 row["return_mean"], color=color(0, BASELINE), linestyle="--",
                 label=arm_label(BASELINE),
             )  # fmt: skip
-        # Of the means: intervals of a few seeds reach above the best return that there can be.
+        # From the means: intervals of a few seeds may exceed the best possible return.
         fit_scale([axis], [[row["return_mean"] for row in [*shown, *off]]])
         axis.set_ylabel("return (sum of rewards)")
         axis.set_title(f"return, {_words(condition)}", fontsize=10)
@@ -313,7 +312,7 @@ def plot_tuning(rows: Sequence[Row], heading: str, file: Path) -> Path | None:
 
 
 def _lines(rows: Sequence[Row], other: str) -> dict[tuple[str, float | None], str]:
-    """Label of each line by option and the value that is not on the axis, in order."""
+    """Labels of the lines by option and the value that is not on the axis, in order."""
     keys = {(row["option"], row[other]) for row in rows}
     ordered = sorted(keys, key=lambda key: (key[0], key[1] is not None, key[1] or 0.0))
     return {
@@ -339,7 +338,7 @@ def _draw(
         mine = [row for row in rows if (row["option"], row[other]) == line and y in row]
         mine.sort(key=lambda row: row[x])
         shade = color(1 + index % _COLORS)
-        # Where colours come again they do so with other markers.
+        # Repeated colours have other markers.
         marker = _MARKERS[(index + index // _COLORS) % len(_MARKERS)]
         aside = np.exp(step * (index - (len(lines) - 1) / 2))
         axis.plot(
@@ -361,7 +360,7 @@ def _draw(
 
 
 def _along(values: Iterable[float]) -> dict[float, float]:
-    """Where values are on a logarithmic axis: 0 is one step below the least of the others.
+    """Positions of values on a logarithmic axis: 0 is one step below the least of the others.
 
     Examples:
         >>> _along([1.0, 0.0, 0.5])
@@ -378,7 +377,7 @@ def _condition(row: Row) -> tuple[Any, ...]:
 
 
 def _distance(disturbances: Sequence[float]) -> tuple[float, ...]:
-    """By the last disturbance first, how far each is from neutral."""
+    """Sort key: distances of the disturbances from neutral, the last disturbance first."""
     pairs = zip(disturbances, DISTURBANCES.values(), strict=True)
     found = [(abs(value - entry.neutral), value) for value, entry in pairs]
     return tuple(number for pair in reversed(found) for number in pair)

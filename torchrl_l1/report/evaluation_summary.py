@@ -1,4 +1,4 @@
-"""What ``torchrl-l1 evaluate`` says of several training seeds: rows and tables."""
+"""The summary of ``torchrl-l1 evaluate`` over training seeds: rows and tables."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ Key = tuple[Any, ...]
 def summarize(rows: Sequence[Row], episodes: Sequence[Row] = ()) -> list[dict[str, Any]]:
     """Median, lowest and highest mean return over the training seeds, per condition.
 
-    A controller is named by its option and the values that the test has set. Only where rows
-    have a ``stage`` has the summary. Disturbances that rows have no column of are neutral. Where
-    an oracle was tested, too, there are the columns of
+    A controller is named by its option and the values that the test has set. The summary has a
+    ``stage`` only if the rows have one. Disturbances without a column are neutral. If an oracle was
+    also tested, there are the columns of
     :func:`~torchrl_l1.report.recovery.recovery_columns`.
 
     Args:
-        rows: of :func:`~torchrl_l1.experiment.evaluate.evaluate`.
-        episodes: the rows of their single episodes, of
+        rows: rows of :func:`~torchrl_l1.experiment.evaluate.evaluate`.
+        episodes: the rows of their single episodes, from
             :func:`~torchrl_l1.experiment.evaluate.evaluate_episodes`.
     """
     keys = ("stage", "policy", "noise", *DISTURBANCES, "l1")
@@ -75,7 +75,7 @@ def _key(row: Row, keys: Sequence[str]) -> Key:
 
 
 def summary_tables(summary: Sequence[Row]) -> str:
-    """A summary as Markdown that reads well in a terminal: a table per stage, policy and noise."""
+    """A summary as Markdown, readable in a terminal: a table per stage, policy and noise."""
     blocks = []
     for (stage, policy, noise), _ in grouped(summary, ("stage", "policy", "noise"), "l1"):
         mine = [row for row in summary if tested_place(row) == (stage, policy, noise)]
@@ -90,31 +90,31 @@ def summary_tables(summary: Sequence[Row]) -> str:
 
 
 def _recovered_words(summary: Sequence[Row]) -> str:
-    """What recovered is, where there is any; over how many policies its interval is."""
+    """The meaning of recovered, if there is any, and over how many policies its interval is."""
     policies = max((int(row.get("recovered_policies") or 0) for row in summary), default=0)
     if not policies:
         return ""
     over = "policies and episodes" if policies > 1 else "the episodes of this one policy alone"
     stars = any(float(row.get("gap") or 0.0) < 0 for row in summary)
-    words = " (*: the disturbance does good, which 1 undoes)" * stars
+    words = " (*: the disturbance increases the return; 1 undoes that)" * stars
     return f"; recovered, with its 95 % interval over {over}{words}"
 
 
 def summary_lines(
     summary: Sequence[Row], keys: Sequence[str] = (), digits: int = 4
 ) -> list[dict[str, str]]:
-    """A line per disturbance, with those disturbances that are not neutral; a column per L1.
+    """A line per condition, with the disturbances that are not neutral; a column per L1.
 
-    Where more than a few disturbances vary, a single column names the one that a line is of.
+    If more than a few disturbances vary, a single column names that of the line.
 
     Args:
-        summary: of :func:`summarize`, or its table read again.
-        keys: what else tells lines apart, in front.
-        digits: significant ones of the returns.
+        summary: rows of :func:`summarize`, or of its table read again.
+        keys: further columns that distinguish lines, at the front.
+        digits: significant digits of the returns.
     """
     names = varied(summary)
     tested = controllers(summary)
-    # Without an oracle there is nothing to say of it.
+    # Without an oracle there is nothing recovered.
     shown = [l1 for l1 in tested if l1 not in UNTUNED] if ORACLE in tested else []
     neutral = {name: entry.neutral for name, entry in DISTURBANCES.items()}
     lines = []

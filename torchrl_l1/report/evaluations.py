@@ -1,4 +1,4 @@
-"""The sections about evaluations of frozen policies: their rows, tables and text."""
+"""The sections on evaluations of frozen policies: rows, tables and text."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ from torchrl_l1.report.style import arm_label, named
 Key = tuple[Any, ...]
 Section = Callable[[Page, AlgorithmFacts, Sequence[Row]], None]
 
-# Longer tables are left to their CSV.
+# Longer tables are only in the CSV.
 _MOST_ROWS = 160
 
-# Columns of what was measured, with the field of an evaluation that each shows and a factor.
+# Columns of measurements, with the field of an evaluation that each shows and a factor.
 _MEANS = {"steps_mean": ("steps_mean", 1), "switches_per_1000_steps": ("switch_rate", 1000)}
 
 
@@ -82,14 +82,14 @@ def evaluation_sections(page: Page, study: Study) -> None:
 
 
 def _drawn_apart(rows: Sequence[Row]) -> str:
-    """Where the settings of an evaluation have changed before it was through with all runs."""
+    """A note if the settings of an evaluation changed before all runs were evaluated."""
     columns = ("episodes_per_seed", "evaluation_seeds")
     mixed = [row for row in rows if any(" " in row[column] for column in columns)]
     if not mixed:
         return ""
     return (
-        f"In {len(mixed)} of {len(rows)} rows of the CSV policies were tested over other episodes "
-        "than each other: `episodes_per_seed` has their numbers, `evaluation_seeds` their seeds."
+        f"In {len(mixed)} of {len(rows)} rows of the CSV, policies were tested over different "
+        "episodes: `episodes_per_seed` has their numbers, `evaluation_seeds` their seeds."
     )
 
 
@@ -132,7 +132,7 @@ def _disturbances(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) ->
         "Disturbances",
         f"Return of frozen policies against {_disturbances_in_words(rows)} that the model "
         "has never seen: mean over training seeds, with its 95 % interval as a band; below it, the "
-        "difference to the same policies without L1 with the interval of its mean.",
+        "difference from the same policies without L1, with the interval of its mean.",
     )
     _against_magnitudes(page, algorithm, "disturbances", rows)
 
@@ -152,13 +152,13 @@ def _robustness(name: str) -> Section:
     def section(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row]) -> None:
         page.heading(
             "Robustness" if name == "robustness" else f"Evaluation `{name}`",
-            "Frozen policies under one disturbance at a time that neither they nor their models "
+            "Frozen policies under one disturbance at a time, which neither they nor their models "
             "have seen: mean ± standard deviation over training seeds.",
         )
         recovery_section(page, algorithm, name, rows)
         page.text(
-            "Against the magnitude, where there are several: means over training seeds with their "
-            "95 % intervals as bands; below, the differences to the same policies without L1."
+            "Against the magnitude, if there are several: means over training seeds with their "
+            "95 % intervals as bands; below, the differences from the same policies without L1."
         )
         _against_magnitudes(page, algorithm, name, rows)
 
@@ -166,7 +166,7 @@ def _robustness(name: str) -> Section:
 
 
 def _disturbances_in_words(rows: Sequence[Row]) -> str:
-    """Those that vary in a table.
+    """The disturbances that vary in a table, in words.
 
     Examples:
         >>> _disturbances_in_words([{"bias": 0.5, "gain": 1.0}, {"bias": 0.0, "gain": 0.6}])
@@ -178,7 +178,7 @@ def _disturbances_in_words(rows: Sequence[Row]) -> str:
 
 
 def _tuning(page: Page, algorithm: AlgorithmFacts, name: str, rows: Sequence[Row]) -> None:
-    """A figure per training cell, where the tests go through values of the controller."""
+    """A figure per training cell, if the tests vary values of the controller."""
     explained = False
     for heading, words, chosen in training_cells(rows):
         policy, swept = tuning_rows(chosen)
@@ -189,7 +189,7 @@ def _tuning(page: Page, algorithm: AlgorithmFacts, name: str, rows: Sequence[Row
         if drawn is not None and not explained:
             page.text(
                 "Switches and returns against the values of the controller that the tests set: "
-                "means over training seeds, lines 95 % intervals of the returns; dashed, the "
+                "means over training seeds, lines 95 % intervals of the returns; dashed: the "
                 "same policies without L1."
             )
             explained = True
@@ -221,7 +221,7 @@ def _evaluation_tables(page: Page, algorithm: AlgorithmFacts, rows: Sequence[Row
 
 
 def _by_actions(algorithm: AlgorithmFacts, rows: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
-    """The rows by how the policies act, in words: those that have no choice first."""
+    """The rows by how the policies act, in words: first those with only one way to act."""
     groups: dict[str, list[Row]] = {words: [] for words in ("", *algorithm.kinds.values())}
     for row in rows:
         groups[algorithm.actions(row["policy"], _stage(row))].append(row)
@@ -242,7 +242,7 @@ def _listed(*words: str) -> str:
 
 
 def evaluation_names(study: Study) -> list[str]:
-    """Names of the evaluations that there are."""
+    """Names of the evaluations."""
     return sorted({name for run in study.runs for name in run.evaluations})
 
 
@@ -250,13 +250,13 @@ def evaluation_rows(study: Study, name: str) -> list[dict[str, Any]]:
     """One row per cell of the training and condition of the test.
 
     ``return_values`` holds the mean returns of the single training seeds, ``std`` is their
-    population standard deviation (as in the paper's tables), and the differences are those to
-    the same policies tested without L1. Runs that are not finished are left out. Where ``l1``
-    is equal to ``training_l1`` the policy was tested with the controller of its training;
-    another controller of that name is marked. Where the test has set values of the controller,
-    ``l1`` names them, and ``option``, ``epsilon`` and ``alpha`` hold them. ``stage`` is there
-    where a test names it, and :func:`~torchrl_l1.report.recovery.recovery_columns` where an
-    oracle was tested, too, and the returns of single episodes are known.
+    population standard deviation (as in the paper's tables), and the differences are from the same
+    policies tested without L1. Unfinished runs are left out. If ``l1`` equals ``training_l1``, the
+    policy was tested with the controller of its training; another controller of that name is
+    marked. If the test has set values of the controller, ``l1`` names them, and ``option``,
+    ``epsilon`` and ``alpha`` hold them. There is a ``stage`` if a test names it, and
+    :func:`~torchrl_l1.report.recovery.recovery_columns` if an oracle was also tested and the
+    returns of single episodes are known.
     """
     rows = []
     for cell, runs in study.cells.items():
@@ -290,10 +290,10 @@ def evaluation_rows(study: Study, name: str) -> list[dict[str, Any]]:
 
 
 def ablation_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Those rows of an evaluation that the ablation is made of, with the ``phase`` of L1.
+    """The rows of an evaluation that make up the ablation, with the ``phase`` of L1.
 
     The test has the noise of the training and no disturbance, and L1 is on in both phases, in
-    one, or in neither. Where L1 is on in both it is the same L1. The oracle is none.
+    one, or in neither. If L1 is on in both, it is the same L1. The oracle does not count as L1.
     """
     chosen = []
     for row in rows:
@@ -306,18 +306,18 @@ def ablation_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def _l1_in(trained: str, tested: str) -> str:
-    """Where L1 is on: ``neither``, ``training only``, ``testing only`` or ``both``."""
+    """Phase with L1 on: ``neither``, ``training only``, ``testing only`` or ``both``."""
     if trained == BASELINE:
         return "neither" if tested == BASELINE else "testing only"
     return "training only" if tested == BASELINE else "both"
 
 
 def _tested(run: Run, test: Evaluation) -> str:
-    """The controller of a test: the training's L1 setting if it is that of the training."""
+    """The controller of a test; the training's L1 setting if it is the training's controller."""
     what = run.identity
     if test.tuned or BASELINE in (what.arm, test.l1):
         return test.controller
-    # Older tables were made with the options as shipped.
+    # Older tables were made with the shipped options.
     own = test.l1 == what.shipped if test.own_l1 is None else test.own_l1
     if own:
         return what.arm
@@ -384,7 +384,7 @@ def _published(run: Run, key: Key) -> dict[str, str]:
 
 def _order(key: Key, test: Evaluation) -> Key:
     l1, noise, *disturbances, policy, _ = key
-    # By the values, where their texts would put 10 before 3.
+    # By value: sorted as text, 10 would precede 3.
     option = test.l1 if test.tuned else l1
     controller = (option, *(value or 0.0 for value in test.tuning.values()))
     place = (policy != "stochastic", noise_order(noise), *disturbances)
@@ -392,10 +392,10 @@ def _order(key: Key, test: Evaluation) -> Key:
 
 
 def evaluation_table(rows: Sequence[Row]) -> str:
-    """Frozen policies under other conditions than they were trained in, a column per L1.
+    """Frozen policies under other conditions than in training, a column per L1.
 
     Args:
-        rows: of one kind of policy and one L1 setting of the training.
+        rows: rows of one kind of policy and one L1 setting of the training.
     """
     notes = Footnotes()
     tested = controllers(rows)
@@ -415,10 +415,10 @@ def evaluation_table(rows: Sequence[Row]) -> str:
 
 
 def tuning_table(rows: Sequence[Row]) -> str:
-    """The same where tests set values of the controller: a line per controller.
+    """The same if tests set values of the controller: a line per controller.
 
     Args:
-        rows: of one kind of policy and one L1 setting of the training.
+        rows: rows of one kind of policy and one L1 setting of the training.
     """
     names = varied(rows)
     lines = [
@@ -438,11 +438,11 @@ def tuning_table(rows: Sequence[Row]) -> str:
 
 
 def _place(row: Row, disturbances: Sequence[str]) -> dict[str, str]:
-    """Where a test belongs; what is neutral is left empty.
+    """The columns that locate a test; neutral ones are left empty.
 
     Args:
-        row: of the table.
-        disturbances: names of those that vary in the table.
+        row: row of the table.
+        disturbances: names of the disturbances that vary in the table.
     """
     return {
         "task": row["task"],
@@ -458,7 +458,7 @@ def ablation_table(rows: Sequence[Row]) -> str:
     """L1 in neither phase, in one or in both, side by side.
 
     Args:
-        rows: of one kind of policy and one kind of L1.
+        rows: rows of one kind of policy and one kind of L1.
     """
     notes = Footnotes()
     lines = []

@@ -1,4 +1,4 @@
-"""How a model's errors grow with the steps that it predicts."""
+"""Growth of a model's errors with the number of predicted steps."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from torchrl_l1.report.style import color, grid, legend_below, save
 
 
 def draw_fit_quality(quality: FitQuality, file: str | Path) -> Path:
-    """Draw the errors of a model against the number of steps that it predicts, per entry.
+    """Draw the errors of a model against the number of predicted steps, per entry.
 
-    The dashed line is the spread of the entry: a model whose error is above it knows less than
-    the mean does. Errors are of trajectories kept out of training; where none is long enough, or
-    where the model diverges, the line ends.
+    The dashed line is the spread of the entry: a model with a larger error predicts worse than the
+    mean. Errors are on trajectories held out of training; the line ends where none is long enough
+    or the model diverges.
 
     Args:
-        quality: of the model, see ``EnsembleDynamics.quality``.
-        file: where to, such as ``"quality.png"``.
+        quality: quality of the model, see ``EnsembleDynamics.quality``.
+        file: the file to write, such as ``"quality.png"``.
 
     Returns:
         the file.

@@ -1,4 +1,4 @@
-"""What a run was, from its configuration: task, noise, arm, and the settings that matter."""
+"""The identity of a run, from its configuration: task, noise, arm, and relevant settings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from torchrl_l1.experiment.settings import (
     schema_defaults,
 )
 
-# Those that learn a policy come before those that only plan, each before its variants.
+# Algorithms that learn a policy come before those that only plan, each before its variants.
 _TRAINED = {
     name: SCHEMAS[name].builds.facts
     for name in sorted(SCHEMAS, key=lambda name: not SCHEMAS[name].builds.facts.samples)
@@ -34,7 +34,7 @@ ALGORITHMS: Mapping[str, AlgorithmFacts] = {
     shown: _TRAINED[name] if shown == name else _TRAINED[name].of_variant(shown)
     for shown, name in _SCHEMA_OF.items()
 }
-"""By name, see :class:`Identity`, in the order in which a report shows them."""
+"""Algorithms by name, see :class:`Identity`, in the order of a report."""
 
 BASELINE = OFF
 """Name of the arm without L1."""
@@ -45,39 +45,38 @@ NOISES: Mapping[str, str] = {
     "observation": "observation noise",
     "both": "action and observation noise",
 }
-"""Noise settings in the order in which tables and figures show them, in words."""
+"""Noise settings in words, in the order of tables and figures."""
 
-# Keys that tell runs apart in other ways, or that do not touch the result.
+# Keys that distinguish runs in other ways, or that do not affect the result.
 _VOLATILE = [key for key in VOLATILE_KEYS if key != "search_path"]
 _NOT_COMPARED = (*_VOLATILE, "seed", "task", "threads", "device", "compile_plans", "l1.compile")
-# Two ways to give the gain of the filter, which is compared under the first of these names.
+# Two ways to give the gain of the filter, which is compared under the first name.
 _FILTER_KEYS = ("l1.alpha", "l1.cutoff")
 _NOISE_KEYS = ("perturbation.action_noise", "perturbation.observation_noise")
-# With the disturbances, what makes another task of the one that is named.
+# Settings that, like disturbances, change the named task.
 _TASK_KEYS = ("dt", "horizon", "reward", "termination")
 
 
 @dataclass(frozen=True)
 class Identity:
-    """What a run is one sample of.
+    """What a run is a sample of.
 
     Attributes:
-        algorithm: that of its recipe, such as ``metrpo``, or the variant that it is of it, such
-            as ``dets`` for PETS with members that predict points.
+        algorithm: the recipe's algorithm, such as ``metrpo``, or its variant, such as ``dets`` for
+            PETS with members that predict points.
         task: such as ``half_cheetah``.
-        noise: option of the ``noise`` group that its noise is equal to, else what there is of it
-            with its half-width, such as ``action 0.3``.
+        noise: option of the ``noise`` group that its noise equals, or else the kind of noise with
+            its half-width, such as ``action 0.3``.
         arm: ``off``, or the option of the ``l1`` group that its controller is closest to,
             whatever the gain of its filter.
         seed: its seed.
         outer_iterations: the number of rows of a finished run.
-        shared: settings that both arms have, key by key, as text.
+        shared: settings that both arms have, by key, as text.
         l1: settings of the controller as text; none for the baseline. ``l1.alpha`` is the gain
             of the filter, however it was given.
-        departures: those in which the controller departs from the option ``arm`` as shipped;
+        departures: settings in which the controller departs from the shipped option ``arm``;
             epsilon does not count.
-        shipped: the option that the controller is equal to but for epsilon; empty if there is
-            none.
+        shipped: the option that the controller equals except for epsilon; empty if there is none.
     """
 
     algorithm: str
@@ -93,12 +92,12 @@ class Identity:
 
     @property
     def model_form(self) -> str:
-        """``nonlinear`` or ``affine`` in the control."""
+        """Form of the model: ``nonlinear`` or ``affine`` in the control."""
         return self.shared.get("model.form", "nonlinear")
 
     @property
     def usual_task(self) -> bool:
-        """Whether nothing but noise disturbs, and steps, episodes and rewards are the task's."""
+        """Whether steps, episodes and rewards are the task's, with no disturbance but noise."""
         return all(
             value == default_text(key, self.algorithm)
             for key, value in self.shared.items()
@@ -107,13 +106,13 @@ class Identity:
 
     @property
     def as_published(self) -> bool:
-        """Whether the published tables are of such runs: algorithm, task, model, controller."""
+        """Whether the published tables include such runs: algorithm, task, model, controller."""
         usual = self.usual_task and self.model_form != "affine" and not self.departures
         return usual and "training" in facts(self.algorithm).tables
 
     @property
     def recipe_departures(self) -> dict[str, str]:
-        """Settings, but for those of the controller, in which it departs from a shipped recipe."""
+        """Settings in which it departs from a shipped recipe, except those of the controller."""
         usual = _recipe_settings(self.shared.get("recipe", ""))
         return {k: v for k, v in self.shared.items() if k in usual and v != usual[k]}
 
@@ -121,8 +120,7 @@ class Identity:
 def identify(config: Mapping[str, Any]) -> Identity:
     """Read a run's resolved configuration.
 
-    Settings that it does not mention, since it is older than they are, have the schema's
-    defaults.
+    Settings that it lacks, because it is older than they are, have the schema's defaults.
 
     Raises:
         KeyError: if it lacks a key that every run has.
@@ -165,12 +163,12 @@ def _recipe_settings(recipe: str) -> dict[str, str]:
         return {}
     settings = OmegaConf.to_container(compose(recipe, ["run_dir=unused"]), resolve=True)
     flat = flatten(settings)
-    del flat["search_path"]  # where the user's code lies
+    del flat["search_path"]  # folders of the user's code
     return {key: _text(value) for key, value in flat.items()}
 
 
 def default_text(key: str, algorithm: str) -> str | None:
-    """A key's default as :class:`Identity` writes values; ``None`` if the schema has none."""
+    """The text of a key's default, as in :class:`Identity`; ``None`` if the schema has none."""
     schema = schema_defaults({"algorithm": _SCHEMA_OF[algorithm]})
     defaults = {**schema, _FILTER_KEYS[0]: DEFAULT_ALPHA}
     return _text(defaults[key]) if key in defaults else None
@@ -206,7 +204,7 @@ def _text(value: Any) -> str:
 
 
 def clean(text: str) -> str:
-    """Text that is text in Markdown, too: it goes into tables, headings and legends.
+    """Text made safe for Markdown: it goes into tables, headings and legends.
 
     Examples:
         >>> clean("a <b> | [c](d)")
@@ -216,10 +214,10 @@ def clean(text: str) -> str:
 
 
 def facts(algorithm: str) -> AlgorithmFacts:
-    """What is known of an algorithm.
+    """The facts of an algorithm.
 
     Raises:
-        ValueError: if nothing is.
+        ValueError: for an unknown algorithm.
 
     Examples:
         >>> facts("dets").samples

@@ -1,4 +1,4 @@
-"""The page of a report, and the tables in it."""
+"""The page of a report and its tables."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from torchrl_l1.experiment.files import bounded, write_table
 from torchrl_l1.report.style import named
 
 Row = Mapping[str, Any]
-"""A line of a table, by its columns."""
+"""A line of a table by column."""
 
 
 class Page:
     """A Markdown page with its CSVs and figures in one folder.
 
     Args:
-        folder: where everything goes; must exist.
+        folder: the folder for everything; must exist.
 
     Attributes:
-        name: of the part that this is, see :meth:`part`; empty for the page itself.
+        name: name of this part, see :meth:`part`; empty for the page itself.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -32,24 +32,24 @@ class Page:
         self._taken: set[str] = set()
 
     def part(self, name: str) -> Page:
-        """The same page, to be continued under a name.
+        """The same page, continued under a name.
 
         Args:
-            name: comes first in headings, captions and names of files; nothing does if empty.
+            name: prefix of headings, captions and file names; none if empty.
         """
         part = Page(self.folder)
         part.name, part._blocks, part._taken = name, self._blocks, self._taken
         return part
 
     def file(self, *words: str) -> Path:
-        """Where a further figure of this part goes; a long name is cut, and ends in its digest.
+        """The file for another figure of this part; a long name is cut and ends in its digest.
 
-        Words that differ in nothing but signs, as -0.5 and 0.5, have names with a number.
+        Words that differ only in signs, such as -0.5 and 0.5, get names with a number.
         """
         return self._free(slug((self.name, *words)), ".png")
 
     def _free(self, name: str, suffix: str) -> Path:
-        """A name that no other file of the page has, also where capitals make no difference."""
+        """A unique name among the files of the page, even if case is ignored."""
         number, file = 1, f"{bounded(name)}{suffix}"
         while file.lower() in self._taken:
             number += 1
@@ -58,7 +58,7 @@ class Page:
         return self.folder / file
 
     def heading(self, text: str, how_to_read: str) -> None:
-        """Begin a section with a sentence on how to read it."""
+        """Begin a section with an explanation of how to read it."""
         self.text(f"## {named(self.name, ' '.join(text.split()))}")
         self.text(how_to_read)
 
@@ -67,9 +67,9 @@ class Page:
         self._blocks += [block for block in blocks if block]
 
     def csv(self, name: str, rows: Sequence[Row]) -> None:
-        """Write a table in full precision and name it; one that is called like another by number.
+        """Write a table in full precision and mention it; names that are taken get a number.
 
-        So may an evaluation be called ``training``.
+        An evaluation may thus be called ``training``.
         """
         prefix = f"{slug((self.name,))}_" if self.name else ""
         file = self._free(prefix + name, ".csv")
@@ -77,7 +77,7 @@ class Page:
         self.text(f"All columns: [{file.name}](./{file.name}).")
 
     def figure(self, file: Path | None, caption: str) -> None:
-        """Show a figure; nothing if there was nothing to draw."""
+        """Show a figure, if there was something to draw."""
         if file is not None:
             self.text(f"![{plain(named(self.name, caption))}]({file.name})")
 
@@ -87,7 +87,7 @@ class Page:
 
 
 def plain(text: object) -> str:
-    r"""Text from a file, as it is, on one line of Markdown.
+    r"""Text from a file, unchanged, as one line of Markdown.
 
     Examples:
         >>> print(plain("a | b <script> ![x](http://y)"))
@@ -96,7 +96,7 @@ def plain(text: object) -> str:
     line = " ".join(re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+", " ", str(text)).split())
     line = line.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     line = re.sub(r"[\\`*|]", r"\\\g<0>", line)
-    # Brackets mean nothing but before another one, or in front of an address.
+    # Brackets have a meaning only before another one or an address.
     return re.sub(r"\[(?=[^\]]*\][(\[])|\](?=[(\[])", r"\\\g<0>", line)
 
 
@@ -112,12 +112,12 @@ def code(text: object) -> str:
 
 
 def _writable(text: str) -> str:
-    """A text with the bytes of paths escaped that are no UTF-8."""
+    """A text in which bytes of paths that are not UTF-8 are escaped."""
     return text.encode(errors="backslashreplace").decode()
 
 
 def _cell(value: object) -> object:
-    """A value of a CSV: text that a spreadsheet would take for a formula is quoted."""
+    """A value for a CSV: text that a spreadsheet would read as a formula is quoted."""
     value = _writable(value) if isinstance(value, str) else value
     if isinstance(value, str) and re.match(r"[=+@\t\r]|-(?![\d.])", value):
         return f"'{value}"
@@ -135,7 +135,7 @@ def slug(words: Sequence[str]) -> str:
 
 
 def markdown(rows: Sequence[Mapping[str, str]]) -> str:
-    """A Markdown table; the keys of the rows are its header. Columns without content go.
+    """A Markdown table with the keys of the rows as its header. Empty columns are dropped.
 
     Without rows it is empty.
     """
@@ -148,7 +148,7 @@ def markdown(rows: Sequence[Mapping[str, str]]) -> str:
 
 
 def values_text(values: Mapping[str, str]) -> str:
-    """What several have in common, or where it differs what each of them has.
+    """The common value of several, or if they differ, the value of each.
 
     Examples:
         >>> values_text({"PETS": "15", "DETS": "15"})
@@ -165,7 +165,7 @@ def values_text(values: Mapping[str, str]) -> str:
 
 
 class Footnotes:
-    """Numbered notes below a table; equal ones share their number."""
+    """Numbered notes below a table; equal ones share a number."""
 
     def __init__(self) -> None:
         self._notes: dict[str, int] = {}
@@ -175,13 +175,13 @@ class Footnotes:
         return f" †{self._notes.setdefault(note, len(self._notes) + 1)}" if note else ""
 
     def below(self, table: str) -> str:
-        """A table with the notes under it, a line each."""
+        """A table with the notes below it, a line each."""
         notes = "\n".join(f"- †{index}: {note}." for note, index in self._notes.items())
         return f"{table}\n\n{notes}".rstrip()
 
 
 def number(value: float | None) -> str:
-    """Three significant digits, and no fewer than the units.
+    """Three significant digits, but at least all digits before the point.
 
     Examples:
         >>> number(2367.31), number(-51.26), number(-0.00312), number(None)
@@ -216,7 +216,7 @@ def spread_text(mean: float | None, spread: float | None) -> str:
 
 
 def return_text(row: Row | None) -> str:
-    """The return of some seeds: mean, standard deviation and interval, as far as there are any."""
+    """The return of some seeds: mean, standard deviation and interval, if known."""
     if row is None:
         return "–"
     seeds = row["seeds"] if "seeds" in row else row["training_seeds"]
@@ -225,7 +225,7 @@ def return_text(row: Row | None) -> str:
 
 
 def difference_text(row: Row) -> str:
-    """A mean difference with its interval, or the differences where there are few."""
+    """A mean difference with its interval, or the single differences if there are few."""
     if row.get("difference_low") is None:
         return _differences(row) or "–"
     return f"{number(row['difference_mean'])} {interval_text(row, 'difference')}"
@@ -248,7 +248,7 @@ def _differences(row: Row) -> str:
 
 
 def paper_text(row: Row, notes: Footnotes) -> str:
-    """What the paper prints, with a mark where that is not to be taken at its word."""
+    """The paper's printed value, with a mark if it has an erratum."""
     if row.get("paper_mean") is None:
         return "–"
     return f"{row['paper_mean']} ± {row['paper_std']}{notes.mark(row['paper_erratum'])}"
@@ -257,12 +257,12 @@ def paper_text(row: Row, notes: Footnotes) -> str:
 def grouped(
     rows: Sequence[Row], keys: Sequence[str], inner: str
 ) -> list[tuple[tuple[Any, ...], dict[str, Row]]]:
-    """The rows that agree in some keys, each group by the value of another key.
+    """Groups of rows that agree in some keys, each keyed by the value of another key.
 
     Args:
         rows: the rows.
-        keys: what a group has in common; empty where a row lacks it.
-        inner: what sets its rows apart.
+        keys: keys in which a group agrees; empty if a row lacks one.
+        inner: key that distinguishes its rows.
     """
     groups: dict[tuple[Any, ...], dict[str, Row]] = {}
     for row in rows:

@@ -1,4 +1,4 @@
-"""The paper's printed tables, with what is wrong with their cells, and its authors' curves."""
+"""The paper's printed tables with errata, and its authors' curves."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from torchrl_l1.report.identity import BASELINE, facts
 from torchrl_l1.report.reading import numeric_rows
 
-# Controllers whose results the paper's "L1" stands for: its own and that of its released code.
+# Controllers that the paper's "L1" stands for: its own and that of its released code.
 _PUBLISHED_ARMS = ("paper", "reference")
 
 
@@ -29,7 +29,7 @@ _TASKS = {
 _NOISES = {"": "none", "_Action_Noise": "action", "_Observation_Noise": "observation"}
 _FORMS = {"_nl": "nonlinear", "_ca": "affine"}
 
-# The authors hold a third of the data out of the fit and log the size of the rest.
+# The authors hold out a third of the data from the fit and log the size of the rest.
 _STEPS_PER_TRAINING_SAMPLE = 1.5
 
 
@@ -38,10 +38,10 @@ class PublishedCell:
     """One printed cell.
 
     Attributes:
-        mean: as printed.
-        std: as printed behind the ``±``.
+        mean: mean as printed.
+        std: standard deviation as printed after the ``±``.
         source: paper and table.
-        erratum: why not to take it at its word; empty if nothing is known.
+        erratum: why not to trust it; empty if nothing is known.
     """
 
     mean: str
@@ -59,8 +59,8 @@ def published_cells() -> dict[tuple[str, str, str, str, str], PublishedCell]:
     """All cells of Tables 1, 2, 4 and 5 of arXiv 2403.14860.
 
     Returns:
-        by table (``"1"``), task, noise, L1 in training and L1 in testing (``on`` or ``off``).
-        In Table 2 the noise is that of the test.
+        cells by table (``"1"``), task, noise, L1 in training and L1 in testing (``on`` or
+        ``off``). In Table 2 the noise is that of the test.
 
     Examples:
         >>> published_cells()["2", "inverted_pendulum", "action", "off", "off"].mean
@@ -83,15 +83,15 @@ def published_cell(
     tested: str,
     algorithm: str = "metrpo",
 ) -> PublishedCell | None:
-    """What the paper's tables say of a training and a test; ``None`` if nothing.
+    """The cell in the paper's tables for a training and a test; ``None`` if there is none.
 
     Args:
         task: the task.
         training_noise: noise of the training environment.
         trained: L1 setting of the training.
-        testing_noise: noise of the test; that of the training in a run's own returns.
+        testing_noise: noise of the test; that of the training for a run's own returns.
         tested: L1 setting of the test.
-        algorithm: see :data:`~torchrl_l1.report.identity.ALGORITHMS`. Of MBMF there are only the
+        algorithm: see :data:`~torchrl_l1.report.identity.ALGORITHMS`. For MBMF there are only the
             returns of the training.
 
     Examples:
@@ -125,13 +125,13 @@ class Curves:
     returns: np.ndarray
 
     def until(self, real_steps: float) -> Curves | None:
-        """The iterations that end within so many real steps, give or take half a one of them.
+        """The iterations that end within so many real steps, give or take half an iteration.
 
         Args:
             real_steps: where to cut.
 
         Returns:
-            the curves up to there, all of them if they end before; ``None`` if none begins before.
+            the curves up to there, complete if they end earlier; ``None`` if none begins earlier.
 
         Example:
             >>> curves = Curves(np.array([[5.0, 10.0, 15.0]]), np.array([[-3.0, -2.0, -1.0]]))
@@ -151,7 +151,7 @@ class ReferenceCurves:
     ``L1_ON``, or ``nl_vs_ca`` for the comparison of nonlinear and control-affine models),
     ``setting`` (``Halfcheetah``, ``Halfcheetah_Action_Noise``, ``Halfcheetah_ca``, ...),
     ``seed``, ``iteration``, ``total_train_samples`` (two thirds of the real steps) and
-    ``average_return``. Other columns are left alone.
+    ``average_return``. Other columns are ignored.
 
     Args:
         path: the file, compressed if its name ends in ``.xz``.
@@ -173,7 +173,7 @@ class ReferenceCurves:
             if iteration <= last.get(whose, -np.inf):
                 raise ValueError(
                     f"{path}: iteration {iteration:g} of {' '.join(whose)} comes after "
-                    f"{last[whose]:g}; sort the rows of each seed by the number, each once"
+                    f"{last[whose]:g}; sort the rows of each seed by iteration, without repetition"
                 )
             last[whose] = iteration
             steps = row["total_train_samples"] * _STEPS_PER_TRAINING_SAMPLE

@@ -1,4 +1,4 @@
-"""Reading the files of runs, cell by cell; whatever is wrong with one names it."""
+"""Reading the files of runs, cell by cell; every error names the file."""
 
 from __future__ import annotations
 
@@ -34,34 +34,34 @@ L1_COLUMNS = {
 """Columns of a report's tables, with the signal that each shows and a factor."""
 
 SIGNALS = tuple(signal for signal, _ in L1_COLUMNS.values())
-"""Columns of a metrics table that only runs with L1 have."""
+"""Columns that only metrics tables of runs with L1 have."""
 
 AGAIN = "Move the run directory away, or run it again"
 """What to do about a run whose files are damaged."""
 
 _EVALUATE_AGAIN = "Delete it and start its campaign again"
 
-# No table of a run comes near; more would be read into memory whole.
+# No table of a run comes near this; larger files would fill memory.
 _MOST_BYTES = 200_000_000
 
 _METRICS = ("iteration", "real_steps", "return_mean", "return_deterministic")
 
 
 def read_metrics(file: Path, stages: int = 0, remedy: str = AGAIN) -> dict[str, np.ndarray]:
-    """Columns of a metrics table; empty ones for a run that has only just begun.
+    """Columns of a metrics table; empty for a run that has only just begun.
 
-    Those of :data:`SIGNALS` are NaN where the run has none.
+    Those of :data:`SIGNALS` are NaN if the run lacks them.
 
     Args:
         file: the table.
-        stages: of the algorithm; with any, there is a column ``stage``.
-        remedy: what an error says to do about it.
+        stages: number of the algorithm's stages; if there are any, there is a column ``stage``.
+        remedy: the remedy in error messages.
     """
     numbers = (*_METRICS, "stage") if stages else _METRICS
     rows = checked_rows(file, numbers, optional=SIGNALS, remedy=remedy) if file.exists() else []
     columns = {name: np.array([row[name] for row in rows]) for name in (*numbers, *SIGNALS)}
     if not np.array_equal(columns["iteration"], np.arange(len(rows))):
-        raise RunDirectoryError(f"{file}: the iterations are not 0, 1, 2, ... without a gap")
+        raise RunDirectoryError(f"{file}: the iterations are not 0, 1, 2, ... without gaps")
     if stages and not _in_turn(columns["stage"], stages):
         raise RunDirectoryError(f"{file}: the stages are not 1 to {stages} in turn")
     return columns
@@ -73,7 +73,7 @@ def _in_turn(stage: np.ndarray, stages: int) -> bool:
 
 
 def read_seconds(file: Path, iterations: int, phases: Sequence[str]) -> dict[str, np.ndarray]:
-    """Seconds of each of the phases in each iteration; NaN where not known."""
+    """Seconds of each phase in each iteration; NaN if unknown."""
     rows = checked_rows(file, ("iteration",), optional=phases) if file.exists() else []
     found = {int(row["iteration"]): row for row in rows}
     return {
@@ -82,7 +82,7 @@ def read_seconds(file: Path, iterations: int, phases: Sequence[str]) -> dict[str
     }
 
 
-# Every table has the columns of these; that of another disturbance may be absent.
+# Every table has columns for these; those of other disturbances may be absent.
 _FIRST_DISTURBANCES = ("bias", "gain")
 
 
@@ -91,14 +91,14 @@ class Evaluation(Condition):
     """A condition with the returns of a run's frozen policy under it.
 
     Attributes:
-        return_mean: mean return over the episodes; not finite where theirs are not.
-        episodes: their number.
-        own_l1: whether the controller was the one of the training; ``None`` in tables that are
-            older than this column.
+        return_mean: mean return over the episodes; not finite if theirs are not.
+        episodes: number of episodes.
+        own_l1: whether the controller was that of the training; ``None`` in tables older than this
+            column.
         switch_rate: switches per step; NaN if unknown or without L1.
         steps_mean: mean length of the episodes; NaN if unknown.
-        returns: of the single episodes; empty if unknown.
-        seed: of the evaluation; ``None`` if unknown.
+        returns: returns of the single episodes; empty if unknown.
+        seed: seed of the evaluation; ``None`` if unknown.
     """
 
     return_mean: float
@@ -111,7 +111,7 @@ class Evaluation(Condition):
 
     @property
     def condition(self) -> tuple[Any, ...]:
-        """What was tested: equal for repetitions. See :func:`condition_columns`."""
+        """The tested condition, equal for repetitions. See :func:`condition_columns`."""
         columns = {**self.columns(), "l1": self.controller, "stage": self.stage or ""}
         return tuple(columns[name] for name in condition_columns())
 
@@ -122,7 +122,7 @@ class Evaluation(Condition):
 
 
 MEASURED: Mapping[str, str] = {"steps_mean": "steps_mean", "switch_rate": SWITCH_RATE}
-"""Fields of an :class:`Evaluation` that tables may lack, with the columns that they come from."""
+"""Optional fields of an :class:`Evaluation`, with the columns that they come from."""
 
 
 def condition_columns() -> tuple[str, ...]:
@@ -136,12 +136,12 @@ def condition_columns() -> tuple[str, ...]:
 
 
 def read_evaluations(file: Path) -> list[Evaluation]:
-    """The rows of an evaluation, with the returns of single episodes where these are beside it.
+    """The rows of an evaluation, with the returns of single episodes if these are beside it.
 
-    Disturbances that it has no column of are neutral.
+    Disturbances without a column are neutral.
 
     Raises:
-        RunDirectoryError: if a file cannot be read, or says two things of one condition.
+        RunDirectoryError: if a file cannot be read or contradicts itself.
     """
     optional = ("own_l1", *MEASURED.values())
     rows = _each_once(file, _condition_rows(file, ("episodes",), optional, ("return_mean",)))
@@ -155,8 +155,8 @@ def read_evaluations(file: Path) -> list[Evaluation]:
         found = singly.get(_condition_key(row), [])
         if found and math.isfinite(row["return_mean"]) and not _is_mean(row, found):
             raise RunDirectoryError(
-                f"{episodes} is not of {file}: its episodes of L1 {row['l1']} have another mean or "
-                f"number than the table says. {_EVALUATE_AGAIN}"
+                f"{episodes} does not belong to {file}: its episodes of L1 {row['l1']} differ in "
+                f"mean or number from the table. {_EVALUATE_AGAIN}"
             )
     return [
         Evaluation(
@@ -183,22 +183,22 @@ def _condition_fields(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _is_mean(row: Mapping[str, Any], returns: Sequence[float]) -> bool:
-    """Whether a row of a table is of these episodes; means were taken in single precision."""
+    """Whether a row of a table matches these episodes; means were taken in single precision."""
     size = max(map(abs, returns))
     same = abs(float(np.mean(returns)) - row["return_mean"]) <= 1e-4 * size + 1e-9
     return same and len(returns) == int(row["episodes"])
 
 
 def _each_once(file: Path, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows, of those that are equal the first: a repetition is no further training seed."""
+    """The rows without duplicates: a repetition is not another training seed."""
     found: dict[tuple[Any, ...], dict[str, Any]] = {}
     for index, row in enumerate(rows):
         number = row.get("episode", 0.0)
         key = (*_condition_key(row), index if math.isnan(number) else (number,))
         if str(found.setdefault(key, row)) != str(row):  # NaN is equal to itself here
             raise RunDirectoryError(
-                f"{file}, line {index + 2}: what it says of L1 {row['l1']} under these conditions "
-                f"is not what a line before it says. {_EVALUATE_AGAIN}"
+                f"{file}, line {index + 2}: its values for L1 {row['l1']} under these conditions "
+                f"contradict an earlier line. {_EVALUATE_AGAIN}"
             )
     return list(found.values())
 
@@ -206,7 +206,7 @@ def _each_once(file: Path, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any
 def _condition_rows(
     file: Path, numbers: Sequence[str], optional: Sequence[str], results: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Rows with the columns of conditions and others; disturbances as far as there are any."""
+    """Rows with the columns of conditions and others; missing disturbances are allowed."""
     later = tuple(name for name in DISTURBANCES if name not in _FIRST_DISTURBANCES)
     return checked_rows(
         file,
@@ -226,7 +226,7 @@ def _condition_key(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def one_policy(tests: Sequence[Evaluation]) -> list[Evaluation]:
-    """The tests of what acts in one way only: each once, as ``stochastic``, however named."""
+    """The tests of policies with one way to act: each once, as ``stochastic``, however named."""
     first = sorted(tests, key=lambda test: test.policy != "stochastic")
     found = [replace(test, policy="stochastic") for test in first]
     chosen: dict[Any, Evaluation] = {}
@@ -236,7 +236,7 @@ def one_policy(tests: Sequence[Evaluation]) -> list[Evaluation]:
 
 
 def distinct_policies(tests: Sequence[Evaluation], algorithm: AlgorithmFacts) -> list[Evaluation]:
-    """The tests, each once where an algorithm acts in one way only, in all stages or in some."""
+    """The tests, each once in stages where the algorithm has only one way to act."""
     single = [test for test in tests if algorithm.acts_in_one_way(test.stage or "")]
     both = [test for test in tests if not algorithm.acts_in_one_way(test.stage or "")]
     return [*one_policy(single), *both]
@@ -256,10 +256,10 @@ def checked_rows(
     results: Sequence[str] = (),
     remedy: str = AGAIN,
 ) -> list[dict[str, Any]]:
-    """As :func:`numeric_rows`, of a file of a run directory.
+    """As :func:`numeric_rows`, for a file of a run directory.
 
     Raises:
-        RunDirectoryError: in its place, with what to do about it, the ``remedy``.
+        RunDirectoryError: instead of ``ValueError``, with the ``remedy``.
     """
     try:
         return numeric_rows(file, numbers, words, optional, optional_words, if_any, results)
@@ -268,7 +268,7 @@ def checked_rows(
 
 
 def read_versions(file: Path) -> dict[str, str]:
-    """Versions by package; none where there is no such file."""
+    """Versions by package; empty if there is no such file."""
     if not file.exists():
         return {}
     try:
@@ -295,14 +295,14 @@ def numeric_rows(
         file: the file, compressed if its name ends in ``.xz``.
         numbers: columns of finite numbers.
         words: columns of text that must not be empty.
-        optional: columns of numbers that may be absent, empty or not finite: NaN then.
+        optional: columns of numbers that may be absent, empty or not finite, which gives NaN.
         optional_words: columns of text that may be absent or empty.
-        if_any: columns that are left out if absent or empty, else of finite numbers.
+        if_any: columns of finite numbers that are left out if absent or empty.
         results: columns of numbers that may be infinite or NaN.
 
     Raises:
         ValueError: if the file cannot be read, a column is missing, a line has more values than
-            there are columns, or a cell holds something else; the message names file and line.
+            there are columns, or a cell is invalid; the message names file and line.
     """
     try:
         reader = csv.reader(io.StringIO(_table_text(file), newline=""), strict=True)
@@ -319,7 +319,7 @@ def numeric_rows(
         rows = [row for row in reader if row]
         most = max(map(len, rows), default=0)
         for line, row in enumerate(rows, start=2) if most > columns else ():
-            # As of a comma in place of a decimal point, which moves all behind it.
+            # For example because of a decimal comma, which shifts the rest of the line.
             if any(row[columns:]):
                 raise ValueError(f"{file}, line {line}: more values than the {columns} columns")
     except (OSError, EOFError, UnicodeDecodeError, lzma.LZMAError, csv.Error) as error:
@@ -348,7 +348,7 @@ def _word(file: Path, line: int, key: str, text: str | None) -> str:
     if not text:
         raise ValueError(f"{file}, line {line}: {key} is empty")
     if not _is_word(text):
-        raise ValueError(f"{file}, line {line}: {key} is {text[:40]!r}, which is no word")
+        raise ValueError(f"{file}, line {line}: {key} is {text[:40]!r}, which is not a word")
     return text
 
 

@@ -1,4 +1,4 @@
-"""What controllers give back of what an oracle would: columns, tables and heat maps."""
+"""The share of an oracle's gain that controllers recover: columns, tables and heat maps."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ from torchrl_l1.report.style import (
 )
 
 FEW_DISTURBANCES = 2
-"""As many that vary have a column each in a table; of more, one column names the disturbance."""
+"""Up to so many varying disturbances have their own columns; beyond, one column names them."""
 
-# Pixels that a figure may have to a side are limited, and so is patience.
+# The pixels of a figure per side are limited, and so is patience.
 _LINE_INCHES, _CELL_INCHES = 0.24, 1.05
 
 
@@ -53,13 +53,13 @@ def recovery_columns(
     """Columns of :func:`~torchrl_l1.report.statistics.recovered`; none if nothing can be paired.
 
     ``gap`` is the oracle's mean return less that without L1, and ``recovered`` the share of it
-    that the controller gives back, each with ``_low`` and ``_high``; there is no ``recovered``
-    where the interval of the gap includes 0. ``recovered_policies`` counts the policies.
+    that the controller recovers, each with ``_low`` and ``_high``; there is no ``recovered``
+    if the interval of the gap includes 0. ``recovered_policies`` counts the policies.
 
     Args:
         off: returns of the episodes of each policy without L1.
-        on: with the controller.
-        oracle: with the oracle.
+        on: the same with the controller.
+        oracle: the same with the oracle.
     """
     shared = [
         policy
@@ -84,7 +84,7 @@ def recovery_columns(
 
 
 def recovered_text(row: Row) -> str:
-    """The share with its interval, or a dash; with a star where the disturbance does good.
+    """The share with its interval, or a dash; starred if the disturbance increases the return.
 
     Examples:
         >>> recovered_text({"recovered": 0.8234, "recovered_low": 0.7, "recovered_high": 0.95})
@@ -101,17 +101,17 @@ def recovered_text(row: Row) -> str:
 
 
 def _star(row: Row) -> str:
-    """Marks a share of what the disturbance gives, and not of what it takes."""
+    """Marks a share of what the disturbance adds to the return, rather than of what it takes."""
     return "*" * (float(row.get("gap") or 0.0) < 0)
 
 
 def is_about_robustness(rows: Sequence[Row]) -> bool:
-    """Whether tests ask an oracle, or go through more disturbances than a few."""
+    """Whether tests include an oracle or more than a few disturbances."""
     return any(row["l1"] == ORACLE for row in rows) or len(varied(rows)) > FEW_DISTURBANCES
 
 
 def varied(rows: Sequence[Row]) -> list[str]:
-    """Names of the disturbances that are not neutral in some row."""
+    """Names of the disturbances that are not neutral in at least one row."""
     found = {name for row in rows for name in disturbed(row)}
     return [name for name in DISTURBANCES if name in found]
 
@@ -120,8 +120,8 @@ def disturbance_cells(row: Row, names: Sequence[str]) -> dict[str, str]:
     """A row's disturbances as cells of a table; neutral ones are left empty.
 
     Args:
-        row: of the table.
-        names: those that vary in the table.
+        row: row of the table.
+        names: names of the disturbances that vary in the table.
 
     Examples:
         >>> disturbance_cells({"bias": 0.5, "gain": 1.0}, ["bias", "gain"])
@@ -136,25 +136,25 @@ def disturbance_cells(row: Row, names: Sequence[str]) -> dict[str, str]:
 
 
 def by_disturbance(row: Row) -> tuple[Any, ...]:
-    """Sort key: undisturbed first, then disturbance by disturbance and by their values."""
+    """Sort key: undisturbed first, then by disturbance and by value."""
     found = disturbed(row)
     order = list(DISTURBANCES)
     return len(found), [(order.index(name), value) for name, value in found.items()]
 
 
 def controllers(rows: Sequence[Row]) -> list[str]:
-    """The controllers of some tests in their order, the oracle last."""
+    """The controllers of some tests in order, the oracle last."""
     return sorted(dict.fromkeys(row["l1"] for row in rows), key=lambda l1: l1 == ORACLE)
 
 
 def robustness_table(rows: Sequence[Row]) -> str:
-    """A line per disturbance: the return of each controller, and what it recovers.
+    """A line per disturbance: the return of each controller, and the share that it recovers.
 
-    Where episodes differ in their length, their mean number of steps stands behind the return.
+    If episodes differ in length, their mean number of steps follows the return.
 
     Args:
-        rows: of :func:`~torchrl_l1.report.evaluations.evaluation_rows`, of one cell and stage of
-            the training, one kind of policy and one noise.
+        rows: rows of :func:`~torchrl_l1.report.evaluations.evaluation_rows`, of one cell and stage
+            of the training, one kind of policy and one noise.
     """
     lengths = {row["steps_mean"] for row in rows if row.get("steps_mean") is not None}
     tested = controllers(rows)
@@ -178,7 +178,7 @@ def robustness_table(rows: Sequence[Row]) -> str:
 
 
 def training_seeds(tests: Mapping[str, Row]) -> str:
-    """How many training seeds the controllers were tested with; of each, where that differs."""
+    """Number of training seeds that the controllers were tested with; of each if they differ."""
     return values_text({arm_label(l1): str(row["training_seeds"]) for l1, row in tests.items()})
 
 
@@ -191,7 +191,7 @@ def _return_text(row: Row | None, with_steps: bool) -> str:
 
 
 def training_cells(rows: Sequence[Row]) -> Iterator[tuple[str, tuple[str, ...], list[Row]]]:
-    """The rows of each cell and stage of the training, with a heading and the words of a file."""
+    """The rows of each cell and stage of the training, with a heading and words for file names."""
 
     def place(row: Row) -> tuple[str, ...]:
         keys = ("task", "training_noise", "training_l1", "variant")
@@ -209,13 +209,13 @@ class HeatMap:
     """What a heat map shows.
 
     Attributes:
-        column: of the rows.
-        words: under the heading.
+        column: column of the rows.
+        words: text below the heading.
         colors: name of a colour map.
-        text: of a row, in its cell.
-        scale: from all values, finite ones, to that of the colours.
-        without: controllers that it has no column for.
-        colored: whether a row's cell has a colour beside its number.
+        text: text of a row's cell.
+        scale: colour scale for all finite values.
+        without: controllers without a column.
+        colored: whether a row's cell has a colour besides its number.
     """
 
     column: str
@@ -228,7 +228,7 @@ class HeatMap:
 
 
 def _share_scale(values: np.ndarray) -> Normalize:
-    # Beyond these the number in the cell says it.
+    # Beyond these limits the number in the cell shows it.
     return TwoSlopeNorm(0.0, -1.0, 1.0)
 
 
@@ -242,14 +242,14 @@ def _return_scale(values: np.ndarray) -> Normalize:
 SHARES = HeatMap(
     "recovered",
     "recovered: 1 as the oracle, 0 as L1 off; empty: these two do not differ\n"
-    "*: the disturbance does good, which 1 undoes",
+    "*: the disturbance increases the return; 1 undoes that",
     "RdBu",
     lambda row: f"{float(row['recovered']):.2f}{_star(row)}",
     _share_scale,
     UNTUNED,
     lambda row: not _star(row),
 )
-"""The shares that controllers recover; none where oracle and L1 off do not differ."""
+"""The shares that controllers recover; empty where oracle and L1 off do not differ."""
 
 RETURNS = HeatMap(
     "return_mean", "mean return", "viridis", lambda row: number(row["return_mean"]), _return_scale
@@ -269,16 +269,16 @@ MEDIANS = HeatMap(
 def plot_heat_map(
     rows: Sequence[Row], shown: HeatMap, heading: str, file: Path, algorithm: AlgorithmFacts
 ) -> Path | None:
-    """Controllers across, disturbances down, a number in each cell; grey and empty where none is.
+    """Controllers across, disturbances down, a number in each cell; missing ones are grey.
 
     There is a panel for each stage, kind of policy and noise.
 
     Args:
-        rows: of one cell of the training.
+        rows: rows of one cell of the training.
         shown: what the cells show.
         heading: title of the figure.
-        file: where to.
-        algorithm: what the policies are of.
+        file: the file to write.
+        algorithm: the algorithm of the policies.
 
     Returns:
         the file, or ``None`` if there is no value to show.
@@ -343,12 +343,12 @@ def _draw(
 
 
 def tested_place(row: Row) -> tuple[str, str, str]:
-    """Stage, kind of policy and noise of a test, each with panels and tables of its own."""
+    """Stage, kind of policy and noise of a test, each with its own panels and tables."""
     return row.get("stage", ""), row["policy"], row["noise"]
 
 
 def panel_title(actions: str, noise: str) -> str:
-    """How a policy acts and under which noise, where there is something to say of either.
+    """How a policy acts and under which noise, if either is worth naming.
 
     Examples:
         >>> panel_title("sampled actions", "action"), panel_title("sampled actions", "none")
@@ -358,19 +358,19 @@ def panel_title(actions: str, noise: str) -> str:
 
 
 def recovery_section(page: Page, algorithm: AlgorithmFacts, name: str, rows: Sequence[Row]) -> None:
-    """Tables and heat maps: the returns, and what controllers give back of what an oracle would."""
+    """Tables and heat maps: the returns, and the share of the oracle's gain that is recovered."""
     if any(row["l1"] == ORACLE for row in rows):
         page.text(
             "The oracle sends the policy's action less the matched disturbance, clipped: no "
             "controller can cancel more. *Recovered* is (L1 − off) / (oracle − off) with the 95 % "
             "interval of a paired bootstrap over policies and their episodes. It is empty where "
-            "the oracle and L1 off do not differ significantly, as under what no input can cancel. "
-            "A star marks where the disturbance does good: a share of 1 undoes that."
+            "the oracle and L1 off do not differ significantly, as for disturbances that no input "
+            "can cancel. A star marks disturbances that increase the return: 1 undoes that."
         )
     if any(row.get("recovered_policies") == 1 for row in rows):
         page.text(
-            "Where there is one training seed the interval is over its episodes alone and says "
-            "nothing of other trainings."
+            "With one training seed, the interval is over its episodes alone and says nothing "
+            "about other trainings."
         )
     for heading, words, chosen in training_cells(rows):
         stage = words[-1]

@@ -1,4 +1,4 @@
-"""Runs as a report sees them, found in folders and read."""
+"""Finding and reading runs for a report."""
 
 from __future__ import annotations
 
@@ -42,20 +42,20 @@ class Run:
 
     Attributes:
         path: the directory.
-        identity: what the run is one sample of.
+        identity: what the run is a sample of.
         real_steps: real environment steps ``(T,)`` after each outer iteration.
         returns: mean return ``(T,)`` of the stochastic policy.
-        deterministic: mean return ``(T,)`` with the policy's mean action; the same where there is
-            one way to act only.
+        deterministic: mean return ``(T,)`` with the policy's mean action; the same if there is
+            only one way to act.
         signals: ``(T,)`` each: what L1 did, see ``SIGNALS``; NaN without L1.
         seconds: wall-clock time ``(T,)`` of each phase, see ``AlgorithmFacts.phases``; NaN
             if unknown.
-        versions: what it ran with.
-        evaluations: by name of the evaluation.
-        stage: number ``(T,)`` of the stage that each outer iteration belongs to, from 1; ``None``
-            where the algorithm has one only.
+        versions: versions that it ran with.
+        evaluations: evaluations by name.
+        stage: number ``(T,)`` of the stage of each outer iteration, from 1; ``None`` if the
+            algorithm has only one.
         diverged: what is no longer finite in its training; empty if all is well.
-        lost: whether its metrics cannot be used; it has no iteration then.
+        lost: whether its metrics are unusable; it then has no iterations.
     """
 
     path: Path
@@ -73,22 +73,22 @@ class Run:
 
     @property
     def finished(self) -> bool:
-        """Whether all outer iterations are there."""
+        """Whether all outer iterations are done."""
         return len(self.returns) >= self.identity.outer_iterations
 
     @property
     def progress(self) -> str:
-        """How far it is, such as ``7 of 33 iterations``, or what has become of it."""
+        """Its progress, such as ``7 of 33 iterations``, or why it has none."""
         if self.lost:
             return "diverged" if self.diverged else "cannot be read"
         return f"{len(self.returns)} of {self.identity.outer_iterations} iterations"
 
     @property
     def ending(self) -> np.ndarray:
-        """Indices of the outer iterations that the return is of.
+        """Indices of the outer iterations over which the return is taken.
 
-        They are the last three, as in the paper; with several stages, those that the return of
-        the last one is of: no other stage is mixed in.
+        They are the last three, as in the paper; with several stages, those of the last stage
+        alone.
         """
         stages = facts(self.identity.algorithm).named_stages
         if self.stage is None or not len(self.stage):
@@ -103,7 +103,7 @@ class Run:
 
     @property
     def final_deterministic(self) -> float:
-        """The same of the deterministic return."""
+        """The same for the deterministic return."""
         return float(self.deterministic[self.ending].mean())
 
     def during(self, position: int) -> np.ndarray:
@@ -118,7 +118,7 @@ class Run:
 
     @property
     def training_seconds(self) -> np.ndarray:
-        """Time ``(T,)`` of all phases but the measuring of returns; NaN if unknown."""
+        """Time ``(T,)`` of all phases except measuring returns; NaN if unknown."""
         phases = [seconds for phase, seconds in self.seconds.items() if phase != MEASURING]
         return np.sum(phases, axis=0)
 
@@ -132,10 +132,10 @@ class Run:
 def l1_means(
     runs: Sequence[Run], parts: Sequence[np.ndarray], columns: Sequence[str] = tuple(L1_COLUMNS)
 ) -> dict[str, float]:
-    """What L1 did in some outer iterations of each run: means over runs of what is known.
+    """What L1 did in some outer iterations of each run: means over runs where known.
 
     Args:
-        runs: any number of them.
+        runs: any number of runs.
         parts: indices of the outer iterations, run by run.
         columns: which of ``switches_per_1000``, ``u_a`` and ``saturation``.
     """
@@ -149,13 +149,13 @@ def l1_means(
 
 @dataclass
 class Findings:
-    """What there is in some folders.
+    """The runs in some folders.
 
     Attributes:
-        runs: those that can be read, in alphabetical order of their paths.
-        errors: what is wrong with the files that cannot be read; each names its file. Of a run
-            with such an evaluation, ``timing.csv`` or ``versions.json`` the rest is in ``runs``.
-        lost: those of which no more can be read than what they are of.
+        runs: readable runs, in alphabetical order of their paths.
+        errors: problems with unreadable files; each names its file. If only an evaluation,
+            ``timing.csv`` or ``versions.json`` of a run is unreadable, the rest is in ``runs``.
+        lost: runs of which nothing but their identity can be read.
     """
 
     runs: list[Run] = field(default_factory=list)
@@ -164,7 +164,7 @@ class Findings:
 
 
 def find_runs(folders: Sequence[Path]) -> list[Run]:
-    """Every run directory in or below some folders, in alphabetical order of their paths.
+    """Every run directory in some folders and their subfolders, in alphabetical order.
 
     Raises:
         FileNotFoundError: if a folder does not exist, or none of them holds a run.
@@ -177,7 +177,7 @@ def find_runs(folders: Sequence[Path]) -> list[Run]:
 
 
 def find_readable_runs(folders: Sequence[Path]) -> Findings:
-    """As :func:`find_runs`, but files that cannot be read are left out and listed.
+    """As :func:`find_runs`, but unreadable files are left out and listed.
 
     Raises:
         FileNotFoundError: if a folder does not exist, or none of them holds a run.
@@ -212,20 +212,19 @@ def find_readable_runs(folders: Sequence[Path]) -> Findings:
 def _read_table(
     file: Path, iterations: int | None, errors: list[RunDirectoryError]
 ) -> list[Evaluation]:
-    """An evaluation whose name is a word, as campaigns ask for: it goes into names and headings.
+    """Read an evaluation whose name is a word, as for campaigns: it goes into names and headings.
 
-    One that was made before a run has gone on is of another policy than the run's last.
+    One made before the run continued is of another policy than the run's last.
 
     Args:
         file: the table.
-        iterations: of the run; of one that is not finished ``None`` will do: its tables enter
-            nothing.
-        errors: returns that are not finite join these; the other rows are as good as ever.
+        iterations: the run's iterations; ``None`` for an unfinished run, whose tables are not used.
+        errors: non-finite returns are appended to these; the other rows stay valid.
     """
     if not re.fullmatch(r"[A-Za-z0-9_.+-]{1,100}", file.stem):
-        raise RunDirectoryError(f"cannot use {file}: its name is no word of at most 100 letters")
+        raise RunDirectoryError(f"cannot use {file}: its name is not a word of at most 100 letters")
     described, known, made_after, seed = file.with_suffix(".yaml"), None, iterations, None
-    # Where it says nothing it is the table that counts.
+    # If it gives no information, the table alone is used.
     with suppress(OSError, ValueError, LookupError, TypeError, AttributeError):
         if described.exists():
             content = load_yaml(described)
@@ -238,7 +237,7 @@ def _read_table(
         )
     if isinstance(made_after, int) and iterations not in (None, made_after):
         raise RunDirectoryError(
-            f"{file} was made after {made_after} iterations, and the run has {iterations}; its "
+            f"{file} was made after {made_after} iterations, but the run has {iterations}; its "
             "campaign makes it again"
         )
     tests = read_evaluations(file)
@@ -266,7 +265,7 @@ def _read_columns(
 ) -> dict[str, np.ndarray]:
     if problem := directory.metrics_problem():
         raise RunDirectoryError(problem)
-    # Run again, it would diverge again: what is told is when and in what, and no remedy.
+    # It would diverge again: report where it diverged instead of a remedy.
     remedy = f"Its {diverged}" if diverged else AGAIN
     columns = read_metrics(directory.metrics_file, stages, remedy)
     iterations = len(columns["iteration"])
@@ -296,7 +295,7 @@ def _read(directory: RunDirectory, config: dict[str, Any], errors: list[RunDirec
     path, stages = directory.path, len(algorithm.named_stages)
     diverged = readable(partial(_diverged, directory.diverged_file), "")
     versions: dict[str, str] = readable(partial(read_versions, path / "versions.json"), {})
-    # As of a run that has only just begun.
+    # As for a run that has only just begun.
     lost = read_metrics(path / "no metrics", stages)
     columns = readable(partial(_read_columns, directory, identity, stages, diverged), lost)
     iterations = len(columns["iteration"])

@@ -1,4 +1,4 @@
-"""The stages of an algorithm that has several: what each has reached."""
+"""The results of each stage of an algorithm with several."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _SHOWN = ("switches_per_1000", "u_a")
 
 
 def stage_sections(page: Page, study: Study) -> None:
-    """What each stage has reached, with L1 and without; nothing where no run is finished."""
+    """The results of each stage with and without L1; nothing if no run is finished."""
     stages = study.facts.named_stages
     rows = stage_rows(study)
     if not rows:
@@ -39,12 +39,12 @@ def stage_sections(page: Page, study: Study) -> None:
     page.heading(
         "Stages",
         "Return at the end of each stage: of what acts in it, the mean over its last outer "
-        f"iterations ({windows}; fewer where there are fewer); mean ± standard deviation over "
+        f"iterations ({windows}; fewer if it has fewer); mean ± standard deviation over "
         "seeds, 95 % interval of the mean. Differences are between runs of the same seed and "
         f"settings. L1 acts around the planner of {study.facts.l1_words} and nowhere else: the "
-        "difference in that stage is what it does there, to the actions and through the data that "
-        "the model is fitted to; the differences in the stages after it are what it has done to "
-        "what they learn.",
+        "difference in that stage is its effect there, on the actions and through the data that "
+        "the model is fitted to; the differences in later stages are its effect on what they "
+        "learn.",
     )
     page.text(stage_table(rows))
     page.csv("stages", rows)
@@ -58,8 +58,8 @@ def stage_rows(study: Study) -> list[dict[str, Any]]:
 
     There is a row for each kind of policy whose returns are known in the stage; a planner has no
     ``policy``. ``std`` is the population standard deviation over seeds and ``real_steps`` counts
-    from the start of the training. What L1 did, as in the table of the training, is there where it
-    acts in the stage. Only finished runs count.
+    from the start of the training. If L1 acts in the stage, there are columns on what it did, as in
+    the table of the training. Only finished runs count.
     """
     rows = []
     for cell, runs in study.cells.items():
@@ -86,7 +86,7 @@ def stage_rows(study: Study) -> list[dict[str, Any]]:
 
 
 def stage_return(run: Run, position: int, stage: Stage, policy: str) -> float:
-    """Mean return over the last outer iterations of a stage that the run has."""
+    """Mean return over the last outer iterations of one of the run's stages."""
     returns = run.returns if policy == "stochastic" else run.deterministic
     return float(returns[run.end_of(position, stage.window)].mean())
 
@@ -138,7 +138,7 @@ def _each(found: Mapping[str, Row], column: str) -> str:
 
 
 def plot_stages(study: Study, task: str, file: Path, name: str = "") -> Path | None:
-    """The same cells with a panel for each noise and stage: the first stages are short.
+    """The same cells with a panel for each noise and stage, because the first stages are short.
 
     Returns:
         the file, or ``None`` if no run has finished an iteration.

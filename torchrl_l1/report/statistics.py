@@ -1,4 +1,4 @@
-"""The figures of merit: the paper's rule, interquartile means, and intervals of means."""
+"""Statistics of returns: the paper's rule, interquartile means, and intervals of means."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from scipy.stats import bootstrap, t, trim_mean
 from torchrl_l1.algorithms.facts import WINDOW
 
 MIN_SAMPLES = 3
-"""With fewer values than this there is no interval: the values themselves say more."""
+"""With fewer values there is no interval: the values themselves are more informative."""
 
 MIN_INTERQUARTILE = 5
-"""With fewer values than this there is no interquartile mean."""
+"""With fewer values there is no interquartile mean."""
 
 _MIN_BOOTSTRAP = 10
 _RESAMPLES = 9999
@@ -35,7 +35,7 @@ def final_return(returns: np.ndarray) -> np.ndarray:
     """Mean over the last three outer iterations.
 
     Args:
-        returns: mean returns ``(..., T)`` of T outer iterations; all of them where T < 3.
+        returns: mean returns ``(..., T)`` of T outer iterations; all are used if T < 3.
 
     Examples:
         >>> float(final_return(np.array([9.0, 1.0, 2.0, 3.0])))
@@ -47,9 +47,9 @@ def final_return(returns: np.ndarray) -> np.ndarray:
 def published_spread(returns: np.ndarray) -> float:
     """The paper's ``±``: population standard deviation over seeds, averaged over iterations.
 
-    The standard deviation is taken in each of the last three outer iterations by itself. The
-    rule is not in the paper; it reproduces what arXiv 2403.14860, Table 1 prints for four of the
-    five tasks from the authors' released logs.
+    The standard deviation is taken in each of the last three outer iterations separately. The
+    rule is not in the paper; from the authors' released logs, it reproduces Table 1 of
+    arXiv 2403.14860 for four of the five tasks.
 
     Args:
         returns: mean returns ``(seeds, T)``.
@@ -74,10 +74,10 @@ def interquartile_mean(values: np.ndarray | Sequence[float], axis: int = 0) -> A
 def mean_interval(values: Sequence[float]) -> Interval | None:
     """95 % interval of the mean.
 
-    Student's t for fewer than ten values, where a bootstrap covers too little: resamples of
-    three to five values hold the mean some four times in five. From ten on the bias-corrected
-    and accelerated bootstrap, or the percentile one where that is not defined. The resampling
-    has a fixed seed: the same values give the same interval.
+    Student's t for fewer than ten values, for which a bootstrap covers too little: its intervals of
+    three to five values contain the mean some four times in five. From ten values on, the
+    bias-corrected and accelerated bootstrap, or the percentile one where that is undefined. The
+    resampling has a fixed seed: the same values give the same interval.
 
     Args:
         values: one value per seed.
@@ -108,8 +108,8 @@ def interquartile_interval(values: Sequence[float]) -> Interval | None:
         values: one value per seed.
 
     Returns:
-        the interval, or ``None`` for fewer than five values: of three the interquartile mean is
-        the mean itself, of four the mean of two.
+        the interval, or ``None`` for fewer than five values: for three, the interquartile mean is
+        the mean itself, and for four, the mean of two.
     """
     if len(values) < MIN_INTERQUARTILE:
         return None
@@ -117,7 +117,7 @@ def interquartile_interval(values: Sequence[float]) -> Interval | None:
 
 
 def mean_summary(name: str, values: Sequence[float]) -> dict[str, Any]:
-    """Mean and, of three values or more, its interval."""
+    """Mean and, for three or more values, its interval."""
     result = {f"{name}_mean": float(np.mean(values))}
     interval = mean_interval(values)
     if interval is not None:
@@ -126,7 +126,7 @@ def mean_summary(name: str, values: Sequence[float]) -> dict[str, Any]:
 
 
 def difference_summary(differences: Sequence[float]) -> dict[str, Any]:
-    """Mean and, of five or more, interquartile mean, with intervals; and the differences."""
+    """Mean and, for five or more, interquartile mean, with intervals; and the differences."""
     if not differences:
         return {}
     result = mean_summary("difference", differences)
@@ -140,17 +140,17 @@ def difference_summary(differences: Sequence[float]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Recovery:
-    """What a controller gives back of what an oracle would.
+    """The share of an oracle's gain that a controller recovers.
 
     Attributes:
         gap: mean return with the oracle less that without control.
-        gap_interval: of the gap.
-        share: that part of the gap by which the controller is better than none: 1 is as good as
-            the oracle, 0 as no control. ``None`` where the interval of the gap includes 0: there
-            is nothing to recover, or too little to be told from chance.
-        interval: of the share.
-        policies: how many policies the intervals are over; with one, they are over its episodes
-            alone and say nothing of other trainings.
+        gap_interval: interval of the gap.
+        share: share of the gap by which the controller is better than none: 1 is as good as the
+            oracle, 0 as no control. ``None`` if the interval of the gap includes 0: there is
+            nothing to recover, or too little to distinguish from chance.
+        interval: interval of the share.
+        policies: number of policies that the intervals are over; with one, they are over its
+            episodes alone and say nothing about other trainings.
     """
 
     gap: float
@@ -166,24 +166,24 @@ def recovered(
     r"""The share :math:`(\bar R_{on} - \bar R_{off}) / (\bar R_{oracle} - \bar R_{off})`.
 
     Its 95 % interval is that of a paired percentile bootstrap in two stages: policies are drawn
-    with replacement, and within each one its episodes; what is drawn counts for all three. Every
+    with replacement, and within each one its episodes; the same draws are used for all three. Every
     policy has the same weight. The resampling has a fixed seed.
 
-    With fewer than three episodes in all that of the gap has no bounds, and there is no share. With
-    few policies both are too narrow, as any bootstrap of few values: of an oracle that gains
-    nothing on average, with 25 episodes each of policies that differ, a share is found in 24 of 100
-    cases with three policies, in 11 with ten.
+    With fewer than three episodes in total, the interval of the gap is unbounded, and there is no
+    share. With few policies both intervals are too narrow, as for any bootstrap of few values: for
+    an oracle that gains nothing on average, with 25 episodes each of policies that differ, a share
+    is found in 24 of 100 cases with three policies, and in 11 with ten.
 
-    Where the disturbance does a policy good, the gap is negative, and 1 still means that all of
-    it is undone.
+    If the disturbance increases the return, the gap is negative, and 1 still means that its effect
+    is fully undone.
 
     Args:
         off: returns of the episodes ``(E,)`` of each policy without control.
-        on: with the controller, of the same policies and from the same resets.
-        oracle: with the oracle.
+        on: returns with the controller, of the same policies and from the same resets.
+        oracle: returns with the oracle.
 
     Raises:
-        ValueError: if there are no episodes, or not the same number of them.
+        ValueError: if there are no episodes, or their numbers differ.
 
     Examples:
         >>> off, oracle = np.array([0.0, 1.0, 2.0]), np.array([10.0, 11.0, 12.0])
@@ -202,7 +202,7 @@ def recovered(
         for returns in (off, on, oracle)
     )
     gain, gap = gain - plain, gap - plain
-    # Resamples of one or two values know nothing of the others that there might have been.
+    # Resamples of one or two values tell nothing about other possible values.
     known = sum(sizes) >= MIN_SAMPLES
     gap_interval = _percentiles(gap[1:]) if known else Interval(-np.inf, np.inf)
     found = Recovery(float(gap[0]), gap_interval, None, None, len(sizes))
@@ -216,7 +216,7 @@ def recovered(
 
 @cache
 def _paired_weights(sizes: tuple[int, ...]) -> np.ndarray:
-    """Weights of all episodes: in the first row of the mean, in the others of resampled ones.
+    """Weights of all episodes: the first row gives the mean, the others resampled means.
 
     Args:
         sizes: number of episodes of each policy.
@@ -226,7 +226,7 @@ def _paired_weights(sizes: tuple[int, ...]) -> np.ndarray:
     times = rng.multinomial(policies, [1 / policies] * policies, size=_RESAMPLES)
     blocks = []
     for index, size in enumerate(sizes):
-        # A policy that is drawn k times brings k resamples of its episodes.
+        # A policy drawn k times contributes k resamples of its episodes.
         drawn = rng.multinomial(times[:, index] * size, [1 / size] * size)
         blocks.append(np.vstack([np.ones((1, size)), drawn]) / (size * policies))
     return np.hstack(blocks)
@@ -241,7 +241,7 @@ def _bootstrap(
     values: Sequence[float], statistic: Callable[..., Any], method: str
 ) -> Interval | None:
     with warnings.catch_warnings(), np.errstate(all="ignore"):
-        # That BCa is not defined is seen from its result.
+        # An undefined BCa interval shows in its result.
         warnings.simplefilter("ignore")
         interval = bootstrap(
             (np.asarray(values, dtype=np.float64),),

@@ -1,4 +1,4 @@
-"""Which runs are samples of the same thing, and what sets the others apart."""
+"""Grouping runs that are samples of the same thing, and what distinguishes the others."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Deviations = tuple[tuple[str, str], ...]
 
 @dataclass(frozen=True)
 class Cell:
-    """Runs that differ in nothing but their seed.
+    """Runs that differ only in their seed.
 
     Attributes:
         task: the task.
@@ -44,17 +44,17 @@ def variant_text(variant: Deviations) -> str:
 class Study:
     """The runs of an algorithm by cell.
 
-    The settings of a task that most of its combinations of noise and arm were run with are its
-    main ones; what departs from them is a variant and is never pooled with them. Settings of
+    The settings with which most of a task's combinations of noise and arm were run are its main
+    ones; runs that depart from them are variants and are never pooled with them. Settings of
     the controller are compared among the runs of one arm.
 
     Args:
-        runs: the runs, in any order. Of those with equal settings and seed the one that is
-            furthest stays, with the evaluations of all that are as far, and the others go to
+        runs: the runs, in any order. Of those with equal settings and seed, the one that has got
+            furthest is kept, with the evaluations of all that are equally far, and the others go to
             :attr:`duplicates`.
 
     Raises:
-        ValueError: if there are no runs, or several algorithms; :func:`studies` takes these.
+        ValueError: if there are no runs, or several algorithms; see :func:`studies` for these.
     """
 
     def __init__(self, runs: Sequence[Run]) -> None:
@@ -73,7 +73,7 @@ class Study:
             main = self._main[task, ""] = _main_settings(members, _shared)
             for arm in {run.identity.arm for run in members}:
                 same = [run for run in members if run.identity.arm == arm]
-                # Chosen from all of them, no run might have both, and the task no main cell.
+                # Chosen from all, they might occur in no run together, leaving no main cell.
                 usual = [run for run in same if main == _values(_shared(run), main)]
                 self._main[task, arm] = _main_settings(same, lambda run: run.identity.l1, usual)
         self.cells: dict[Cell, list[Run]] = {}
@@ -83,7 +83,7 @@ class Study:
 
     @property
     def facts(self) -> AlgorithmFacts:
-        """What there is to know of the algorithm."""
+        """The facts of the algorithm."""
         return facts(self.algorithm)
 
     def cell(self, run: Run) -> Cell:
@@ -95,7 +95,7 @@ class Study:
         return Cell(what.task, what.noise, what.arm, departing)
 
     def main_settings(self, task: str, arm: str = BASELINE) -> dict[str, str]:
-        """Values of the main cells, of those settings that differ between runs."""
+        """Values in the main cells of the settings that differ between runs."""
         return {**self._main[task, ""], **self._main.get((task, arm), {})}
 
     def tasks(self) -> list[str]:
@@ -103,13 +103,13 @@ class Study:
         return list(dict.fromkeys(cell.task for cell in self.cells))
 
     def comparisons(self) -> list[tuple[str, ...]]:
-        """Sets of settings that cells depart in, none part of another: a comparison for each."""
+        """Sets of settings in which cells depart, none a subset of another, to compare by."""
         sets = {frozenset(key for key, _ in cell.variant) for cell in self.cells if cell.variant}
         largest = [one for one in sets if not any(one < other for other in sets)]
         return sorted(tuple(sorted(one)) for one in largest)
 
     def compared(self, keys: Sequence[str]) -> list[Cell]:
-        """Cells that depart in these settings alone, and the main cells to hold them against."""
+        """Cells that depart in these settings alone, and the main cells to compare with."""
 
         def departs(cell: Cell) -> bool:
             return bool(cell.variant) and {key for key, _ in cell.variant} <= set(keys)
@@ -137,8 +137,8 @@ class Study:
 def studies(runs: Sequence[Run]) -> list[Study]:
     """A study for each algorithm, in the order of :data:`ALGORITHMS`.
 
-    Runs of different algorithms are samples of different things, and what sets them apart is more
-    than some settings: they are not pooled, and are no variants of each other.
+    Runs of different algorithms are samples of different things and differ in more than settings:
+    they are neither pooled nor treated as variants of each other.
     """
     groups: dict[str, list[Run]] = {}
     for run in _with_changed_files(runs):
@@ -147,9 +147,9 @@ def studies(runs: Sequence[Run]) -> list[Study]:
 
 
 def _with_changed_files(runs: Sequence[Run]) -> list[Run]:
-    """The runs with the digests of the user's files among their settings, where some differ.
+    """The runs, with digests of the user's files among their settings if some differ.
 
-    Runs that are older than these digests have none.
+    Runs older than these digests have none.
     """
     digests = [{k: v for k, v in run.versions.items() if v.startswith("sha256 ")} for run in runs]
     found: dict[str, set[str]] = {}
@@ -166,7 +166,7 @@ def _with_changed_files(runs: Sequence[Run]) -> list[Run]:
 
 
 def with_baselines(study: Study, runs: Sequence[Run]) -> tuple[list[tuple[Run, Run]], list[str]]:
-    """Each finished run of a cell with its finished baseline, and the seeds of either without."""
+    """Each finished run of a cell with its finished baseline, and the seeds without a pair."""
     pairs = []
     for run in runs:
         baseline = study.baseline_of(run)
@@ -183,7 +183,7 @@ def with_baselines(study: Study, runs: Sequence[Run]) -> tuple[list[tuple[Run, R
 
 
 def place_columns(cell: Cell) -> dict[str, Any]:
-    """Where a cell is, as the first columns of a table."""
+    """The columns that locate a cell, first in a table."""
     return {
         "task": cell.task,
         "noise": cell.noise,
@@ -193,16 +193,16 @@ def place_columns(cell: Cell) -> dict[str, Any]:
 
 
 def _distinct(runs: Sequence[Run], same: Callable[[Run], Hashable]) -> tuple[list[Run], list[Run]]:
-    """One run of each kind, the one that is furthest, and the others.
+    """One run of each kind, the one that has got furthest, and the others.
 
-    An evaluation that the one lacks comes from another that is as far. Of an evaluation that
-    both have, the conditions that are missing come from it too where the returns of the
-    trainings are equal, and the seed and the number of the episodes: then they are of the same
-    policy, from the same resets.
+    An evaluation that it lacks comes from another run that is equally far. If both have an
+    evaluation, missing conditions also come from the other, provided that the returns of the
+    trainings and the seed and number of the episodes are equal: then they are of the same policy,
+    from the same resets.
 
     Args:
         runs: the runs, in order of preference.
-        same: equal for runs of one kind.
+        same: key that is equal for runs of one kind.
     """
     groups: dict[Hashable, list[Run]] = {}
     for run in runs:
@@ -261,9 +261,9 @@ def _main_settings(
     settings: Callable[[Run], Mapping[str, str]],
     candidates: Sequence[Run] = (),
 ) -> dict[str, str]:
-    """Of the settings that differ, the combination that covers most of a task.
+    """The combination of differing settings that covers most of a task.
 
-    Only combinations of the candidates count, or of all runs where there are none.
+    Only combinations of the candidates count, or of all runs if there are none.
     """
     every = dict.fromkeys(key for run in runs for key in settings(run))
     keys = [key for key in every if len({settings(run).get(key) for run in runs}) > 1]
@@ -290,7 +290,7 @@ def _main_settings(
 
 
 def noise_order(noise: str) -> tuple[object, ...]:
-    """Sort key: the paper's order, then noise of other strengths, by its kind and its strength.
+    """Sort key: the paper's order, then noise of other strengths, by kind and strength.
 
     Examples:
         >>> sorted(["action 0.3, observation 1", "action 1e-05", "action 0.3", "both"],

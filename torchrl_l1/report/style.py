@@ -1,4 +1,4 @@
-"""Colours, names and scales that all figures share."""
+"""Colours, names and scales shared by all figures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from torchrl_l1.report.identity import BASELINE, NOISES
 
 _DPI = 130
 
-# Okabe and Ito: told apart with any colour vision. Grey is kept for the authors' curves.
+# Okabe and Ito: distinguishable with any colour vision. Grey is reserved for the authors' curves.
 _ARMS = {BASELINE: "#D55E00", "paper": "#0072B2", "robust": "#009E73"}
 _ARMS |= {"reference": "#E69F00", "slow": "#CC79A7"}
 _ARMS[ORACLE] = "#000000"
@@ -38,18 +38,18 @@ _MARKERS = "osD^"
 
 
 def color(index: int, arm: str | None = None) -> str:
-    """Colour of an arm, or of the n-th of several lines."""
+    """Colour of an arm, or of the n-th line."""
     return _ARMS.get(arm or "", _CYCLE[index % len(_CYCLE)])
 
 
 @dataclass(frozen=True)
 class Look:
-    """How a line differs from the others of its figure.
+    """How a line differs from the others in its figure.
 
     Attributes:
-        color: of an arm its own, which no other line has.
-        style: as matplotlib takes it; another one, like the marker, where colours come again.
-        marker: at its points, where it has any.
+        color: an arm has its own colour, which no other line has.
+        style: matplotlib line style; like the marker, it changes when colours repeat.
+        marker: marker of its points, if it has any.
     """
 
     color: str
@@ -58,7 +58,7 @@ class Look:
 
 
 def looks(names: Collection[str]) -> dict[str, Look]:
-    """How to draw several lines, by name, that of an arm or any other.
+    """How to draw several lines, by the name of an arm or any other name.
 
     Examples:
         >>> [look.color for look in looks(["off", "paper", "paper epsilon=0.3"]).values()]
@@ -89,7 +89,7 @@ def arm_label(arm: str) -> str:
 
 
 def arm_style(arm: str, arms: Sequence[str]) -> Any:
-    """Style of an arm's lines where the colour is that of the algorithm.
+    """Style of an arm's lines if the colour marks the algorithm.
 
     Args:
         arm: the arm.
@@ -112,7 +112,7 @@ def algorithm_label(name: str, arm: str) -> str:
 
 
 def named(name: str, text: str) -> str:
-    """A heading or caption under the name of an algorithm, if it has one.
+    """A heading or caption prefixed with the name of an algorithm, if there is one.
 
     Examples:
         >>> named("PETS", "Training"), named("", "Training")
@@ -128,7 +128,7 @@ def title(task: str, noise: str | None = None) -> str:
         >>> title("half_cheetah", "action")
         'Half cheetah, action noise'
     """
-    # Names of environments of elsewhere stay as they are.
+    # Names of external environments stay as they are.
     name = task if re.search(r"[/:]", task) else task.replace("_", " ").capitalize()
     return name if noise is None else f"{name}, {noise_words(noise)}"
 
@@ -152,7 +152,7 @@ def grid(panels: int, columns: int, width: float, height: float) -> tuple[Figure
     """A figure with so many panels, in rows of at most ``columns``; sizes in inches."""
     columns = min(panels, columns)
     rows = -(-panels // columns)
-    # A single panel still has to carry a legend of some width.
+    # A single panel still needs room for a legend.
     figure = Figure(figsize=(max(width * columns, 6.4), height * rows), dpi=_DPI)
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False)
@@ -163,14 +163,14 @@ def grid(panels: int, columns: int, width: float, height: float) -> tuple[Figure
 
 
 def reaches_far_below(values: np.ndarray, below: float = -5.0) -> bool:
-    """Whether returns lie between 0 and far below, so that only a logarithm shows them all."""
+    """Whether returns range from 0 to far below, so that only a logarithm shows them all."""
     return bool(values.size and -0.5 < values.max() <= 0 and values.min() < below)
 
 
 def fit_scale(axes: Sequence[Axes], values: Iterable[np.ndarray | Sequence[float]]) -> None:
-    """A symmetric logarithmic scale where returns lie between 0 and far below.
+    """A symmetric logarithmic scale if returns range from 0 to far below.
 
-    On the pendulum -100 is a fallen pole, -1 a poor and -0.01 a good controller.
+    On the pendulum, -100 is a fallen pole, -1 a poor and -0.01 a good controller.
     """
     every = np.concatenate([np.asarray(list(value), dtype=float) for value in values])
     if reaches_far_below(every):
@@ -179,7 +179,7 @@ def fit_scale(axes: Sequence[Axes], values: Iterable[np.ndarray | Sequence[float
             axis.set_yscale("symlog", linthresh=0.1, linscale=0.5)
             # In plain text: formulas are off, since names come from files.
             axis.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
-            # The margins would otherwise be those of the linear scale.
+            # Otherwise the margins would be those of the linear scale.
             axis.set_ylim(1.6 * every.min(), 0.03)
 
 
@@ -189,14 +189,14 @@ def legend_below(figure: Figure, axes: Sequence[Axes], last: Sequence[str] = ())
     Args:
         figure: the figure.
         axes: its panels.
-        last: beginnings of labels that come at the end.
+        last: prefixes of labels that come last.
     """
     entries: dict[str, Artist] = {}
     for axis in axes:
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     labels = sorted(entries, key=lambda label: label.startswith(tuple(last)))
-    # Inches that an entry takes at this size of letters.
+    # Width of an entry at this font size, in inches.
     width = 0.075 * max(map(len, labels), default=0) + 0.6
     fitting = max(1, int(figure.get_figwidth() / width))
     rows = -(-len(labels) // fitting)
@@ -214,22 +214,22 @@ def save(figure: Figure, file: Path) -> Path:
     """Write a figure."""
     for each in figure.axes:
         for axis in (each.xaxis, each.yaxis):
-            # Its own are formulas, which are off.
+            # Its default labels are formulas, which are off.
             if isinstance(axis.get_major_formatter(), LogFormatter):
                 axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             if isinstance(axis.get_minor_formatter(), LogFormatter):
                 low, high = axis.get_view_interval()
                 axis.set_minor_formatter(LogFormatter() if high < 10 * low else NullFormatter())
-    # Labels hold values from files: what stands between dollars is no formula. Other figures of the
-    # process are the user's.
+    # Labels contain values from files: text between dollar signs is not a formula. Other figures in
+    # the process are the user's.
     for text in figure.findobj(Text):
         text.set_parse_math(False)
-    # Labels of ticks are made in drawing.
+    # Tick labels are created while drawing.
     with matplotlib.rc_context({"text.parse_math": False}):
-        # As a layout of the figure's own it would be followed by a drawing that nobody sees.
+        # As the figure's own layout, it would cause another drawing that nobody sees.
         ConstrainedLayoutEngine().execute(figure)
         write_through(file, lambda buffer: figure.savefig(buffer, format=file.suffix[1:] or "png"))
-    # Nobody needs its pixels any more; circles of what was drawn before would stay for long.
+    # Its pixels are no longer needed; reference cycles would keep them for long.
     FigureCanvasBase(figure)
     gc.collect(1)
     return file

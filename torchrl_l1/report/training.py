@@ -1,4 +1,4 @@
-"""What a training has reached: the paper's Table 1, paired differences, comparisons, and times."""
+"""Results of training: the paper's Table 1, paired differences, comparisons, and times."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ from torchrl_l1.report.statistics import (
 from torchrl_l1.report.study import Cell, Study, place_columns, with_baselines
 from torchrl_l1.report.style import arm_label, looks, named, title
 
-# More settings are told in the text and in the table, not in headings and legends.
+# More settings are listed in the text and in the table, not in headings and legends.
 _MOST_KEYS, _LONGEST_LABEL = 6, 100
 
 
 def training_sections(page: Page, study: Study, reference: ReferenceCurves | None) -> None:
-    """Everything that is known from the runs' own returns.
+    """The sections on the runs' own returns.
 
     Args:
-        page: where to.
+        page: the page.
         study: the runs.
-        reference: curves of the authors' logs; left out where they are of another algorithm.
+        reference: curves of the authors' logs; left out if they are of another algorithm.
     """
     if not study.facts.reference_logs:
         reference = None
@@ -64,7 +64,7 @@ def _training(page: Page, study: Study, reference: ReferenceCurves | None) -> No
     page.heading(
         "Training",
         "Return is the mean over seeds of the mean over the last three outer iterations"
-        + " (fewer where the last stage has or counts fewer)" * bool(study.facts.named_stages)
+        + " (fewer if the last stage has or counts fewer)" * bool(study.facts.named_stages)
         + ", of sampled actions as in the paper" * study.facts.samples
         + "; the spread is the paper's ± (standard deviation over "
         "seeds in each of these iterations, averaged), the interval that of the mean over seeds. "
@@ -77,9 +77,9 @@ def _training(page: Page, study: Study, reference: ReferenceCurves | None) -> No
 
 def _l1_did(study: Study) -> str:
     if not study.facts.stages[-1].with_l1:
-        return f"L1 acts in {study.facts.l1_words} only; what it did is under Stages."
+        return f"L1 acts in {study.facts.l1_words} only; see Stages for what it did."
     return (
-        "What L1 did (switches, mean norm of its input, share of actions that a bound cut) are "
+        "Values of L1 (switches, mean norm of its input, share of actions cut by a bound) are "
         "means over the same iterations."
     )
 
@@ -100,13 +100,13 @@ def _main_settings(study: Study) -> str:
             lines.append(f"- {task}: {', '.join(settings)}")
     if not lines:
         return ""
-    return "Runs with other settings than these have tables of their own:\n\n" + "\n".join(lines)
+    return "Runs with settings other than these have their own tables:\n\n" + "\n".join(lines)
 
 
 def _recipe_departures(study: Study) -> str:
     lines = []
     for task in study.tasks():
-        # What main cells differ in is told above.
+        # Settings in which main cells differ are listed above.
         told = study.main_settings(task)
         main = next(cell for cell in study.cells if cell.task == task and not cell.variant)
         departures = study.cells[main][0].identity.recipe_departures
@@ -140,7 +140,7 @@ def run_rows(study: Study) -> list[dict[str, Any]]:
 def training_row(
     cell: Cell, runs: Sequence[Run], reference: ReferenceCurves | None = None
 ) -> dict[str, Any]:
-    """A cell: our returns over its finished runs, the paper's, the authors' logged ones.
+    """A cell: the returns of its finished runs, the paper's, and those in the authors' logs.
 
     The return is the mean over seeds of the mean over :attr:`Run.ending`.
     """
@@ -188,9 +188,9 @@ def training_row(
 
 
 def paired_rows(study: Study) -> list[dict[str, Any]]:
-    """L1 less the baseline over the seeds that both have, by stochastic and mean actions.
+    """L1 less the baseline over the seeds that both have, for stochastic and mean actions.
 
-    Where there is one way to act only, a row has no ``policy``.
+    If there is only one way to act, a row has no ``policy``.
     """
     rows = []
     for cell, runs in study.cells.items():
@@ -219,14 +219,14 @@ def paired_rows(study: Study) -> list[dict[str, Any]]:
 
 
 def _deterministic(run: Run, study: Study) -> dict[str, float | None]:
-    """The return with mean actions, if it is another one."""
+    """The return with mean actions, if it differs."""
     if not study.facts.samples:
         return {}
     return {"return_deterministic": run.final_deterministic if run.finished else None}
 
 
 def training_table(rows: Sequence[Row]) -> str:
-    """The paper's Table 1, ours beside it, with footnotes to its cells."""
+    """The paper's Table 1 beside the measured values, with footnotes to its cells."""
     notes = Footnotes()
     lines = [
         {
@@ -262,8 +262,8 @@ def _pairs(page: Page, study: Study) -> None:
     page.heading(
         "L1 less baseline",
         "Differences of the same return between runs of the same seed and settings with and "
-        "without L1, with 95 % intervals; the interquartile mean takes five pairs, and fewer than "
-        "three are shown as they are. With a handful of seeds a single one may move an interval "
+        "without L1, with 95 % intervals; the interquartile mean needs five pairs, and fewer than "
+        "three are shown as they are. With a handful of seeds, a single one may move an interval "
         "to either side of 0.",
     )
     page.text(paired_table(rows))
@@ -271,7 +271,7 @@ def _pairs(page: Page, study: Study) -> None:
 
 
 def paired_table(rows: Sequence[Row]) -> str:
-    """Differences to the baseline of the same seed."""
+    """Differences from the baseline of the same seed."""
     lines = [
         {
             "task": row["task"],
@@ -295,8 +295,8 @@ def _comparisons(page: Page, study: Study, reference: ReferenceCurves | None) ->
             f"By {_keys_text(keys)}",
             f"The settings are {', '.join(map(code, keys))}. "
             * (len(keys) > _MOST_KEYS)
-            + "The same table for runs that depart from the main ones in these settings, and the "
-            "main ones of the same task and noise."
+            + "The same table for runs that depart from the main ones in these settings, and for "
+            "the main ones of the same task and noise."
             + " It is the comparison of the paper's Figure 2."
             * ("model.form" in keys and study.facts.compares_models),
         )
@@ -323,7 +323,7 @@ def plot_comparison(
 ) -> Path | None:
     """The cells of a task that depart in some settings, and its main ones.
 
-    Where the settings include the form of the model this is the paper's Figure 2.
+    If the settings include the form of the model, this is the paper's Figure 2.
 
     Returns:
         the file, or ``None`` if no run has finished an iteration.
@@ -351,7 +351,7 @@ def plot_comparison(
 
 
 def _name(study: Study, cell: Cell, keys: Sequence[str], row: int) -> str:
-    """In the legend: the settings, or the row of the table where they are many."""
+    """A legend label: the settings, or the row of the table if there are many."""
     settings = study.describe(cell, keys)
     if len(settings) > _LONGEST_LABEL:
         settings = f"{settings[:_LONGEST_LABEL]} ... (row {row} of the table)"
@@ -369,8 +369,8 @@ def _time(page: Page, study: Study) -> None:
     page.heading(
         "Where the time goes",
         "Wall-clock seconds of an outer iteration in each of its phases, medians over all "
-        "iterations of the finished runs, and the mean training time per real step. The times are "
-        "those of the machine, with whatever else it did.",
+        "iterations of the finished runs, and the mean training time per real step. The times "
+        "depend on the machine and its other load.",
     )
     page.text(time_table(rows, study.facts))
     page.csv("time", rows)
@@ -379,10 +379,10 @@ def _time(page: Page, study: Study) -> None:
 def time_rows(study: Study) -> list[dict[str, Any]]:
     """Seconds per outer iteration in each phase, for each main cell whose times are known.
 
-    The phases that the table shows are medians over all outer iterations of all finished runs, and
-    ``ms_per_step`` is the training time per real step of whole runs, random data included and
-    ``evaluate`` left out. Where an algorithm has several stages there is a row for
-    each, of its iterations and real steps, and ``share`` is its part of the training time.
+    The phases in the table are medians over all outer iterations of all finished runs, and
+    ``ms_per_step`` is the training time per real step of whole runs, including random data but
+    not ``evaluate``. If an algorithm has several stages, there is a row for each, of its
+    iterations and real steps, and ``share`` is its share of the training time.
     """
     rows = []
     phases = tuple(study.facts.timed_phases)
@@ -405,7 +405,7 @@ def time_rows(study: Study) -> list[dict[str, Any]]:
 def _times(
     runs: Sequence[Run], parts: Sequence[np.ndarray], phases: Sequence[str]
 ) -> dict[str, float]:
-    """Medians over the outer iterations of these parts of the runs, and time per real step."""
+    """Medians over the outer iterations of these parts of the runs, and the time per real step."""
     found = {
         phase: [run.seconds[phase][part] for run, part in zip(runs, parts, strict=True)]
         for phase in phases
