@@ -1,10 +1,10 @@
 """The tutorial, in cells: `_tutorial.py` runs it when the documentation is built."""
 
 # %% [markdown]
-# This page is a script, `docs/tutorial.py`, and all that it shows was computed when this
-# documentation was built. It trains a policy by PPO, as any of TorchRL's examples does, and knows
-# nothing of L1 until then. Then it asks what a constant bias on the motor does to the policy, and
-# puts L1 in between. Settings are small: the whole takes less than a minute on one core.
+# This page is the script `docs/tutorial.py`, and everything it shows was computed when this
+# documentation was built. It first trains a policy by PPO, without L1, as TorchRL's own examples
+# do. Then it tests what a constant bias on the motor does to the policy, and puts L1 in between.
+# The settings are small: all of it takes less than a minute on one core.
 #
 # ## A policy
 
@@ -42,8 +42,8 @@ value = MLP(in_features=4, out_features=1, num_cells=[64, 64], activation_class=
 critic = ValueOperator(value, in_keys=["observation"])
 
 # %% [markdown]
-# Proximal policy optimisation, 1600 steps of eight pendulums at a time. What is printed is of
-# the policy with its exploration noise:
+# Proximal policy optimisation, on batches of 1600 steps from eight pendulums. The numbers printed
+# are those of the policy with its exploration noise:
 
 # %%
 advantage = GAE(gamma=0.99, lmbda=0.95, value_network=critic, average_gae=True)
@@ -75,10 +75,10 @@ collector.shutdown()
 # %% [markdown]
 # ## L1 around it
 #
-# {func}`~torchrl_l1.deployment.robustify` takes the actor as it is. It runs it with exploration
-# noise in the undisturbed environment, fits an ensemble to what it has seen, and calibrates the
-# controller. The table says, entry by entry of the observation (position, angle, and their
-# rates), what the model misses.
+# {func}`~torchrl_l1.deployment.robustify` takes the actor as it is. It runs the actor with
+# exploration noise in the undisturbed environment, fits an ensemble to the data, and calibrates the
+# controller. The table shows what the model misses, for each entry of the observation (position,
+# angle, and their rates).
 
 # %%
 robust = torchrl_l1.robustify("gymnasium/InvertedPendulum-v5", actor, steps=4000, progress=False)
@@ -87,8 +87,8 @@ print(robust.model.quality)
 # %% [markdown]
 # ## What it is worth
 #
-# The motor now pushes with a bias that neither policy nor model has met, and that nobody tells
-# the controller. The oracle is told.
+# The motor now has a bias that neither policy nor model has met. The controller is not told what
+# it is; the oracle is.
 
 # %%
 table = robust.evaluate({"bias": [1.0, 1.5]}, episodes=5, most_steps=300, progress=False)
@@ -100,9 +100,9 @@ chart = table.plot("tutorial.png")
 # %% [markdown]
 # ## In the loop
 #
-# `wrap` puts L1 into an environment. Its `action` is what the policy chose; what reached the
-# motor before the bias is `u_exec`. The difference, within some steps, is the bias with its sign
-# turned.
+# `wrap` puts L1 into an environment. There `action` is what the policy chose, and `u_exec` is what
+# L1 sent to the motor, to which the bias is added. Within a few steps the difference of the two is
+# the bias with its sign reversed.
 
 # %%
 biased = TransformedEnv(GymEnv("InvertedPendulum-v5"), ActuatorBias(1.0))
@@ -111,5 +111,5 @@ sent = (data["next", "l1", "u_exec"] - data["action"]).flatten()
 print([round(value, 2) for value in sent[:100:10].tolist()])
 
 # %% [markdown]
-# `robust.save("folder")` keeps model, settings and calibration; [Robustify](robustify.md) says
-# how to load them, and how to get a film or a file for a machine without TorchRL.
+# `robust.save("folder")` keeps model, settings and calibration. [Robustify](robustify.md) says how
+# to load them, make a film, or export a file for a machine without TorchRL.
