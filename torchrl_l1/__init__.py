@@ -1,8 +1,9 @@
 """Robust model-based reinforcement learning with L1 adaptive control, for TorchRL.
 
-The names users compose are exported here; everything else lives in the sub-packages ``control``,
-``dynamics``, ``planning``, ``envs``, ``objectives``, ``algorithms``, ``experiment``, ``campaign``,
-``report`` and ``deployment``. They are loaded when first asked for: torch takes seconds.
+The names that users compose are exported here; everything else lives in the sub-packages
+``control``, ``dynamics``, ``planning``, ``envs``, ``objectives``, ``algorithms``, ``experiment``,
+``campaign``, ``report`` and ``deployment``. Names are loaded on first use, since torch takes
+seconds to import.
 """
 
 from __future__ import annotations

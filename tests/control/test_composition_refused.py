@@ -125,7 +125,7 @@ class Zeroing(Dropping):
 
 IS_NOT = r"'observation' is not what the environment gave: .* separate out_keys, .*observation_key"
 OVERWRITES = r"comes after L1Transform and overwrites 'observation'.*separate out_keys"
-DISTURBS = r"comes after L1Transform, so that it disturbs.*write Compose\(\.\.\., {}\(\.\.\.\), L1T"
+DISTURBS = r"comes after L1Transform and so disturbs.*write Compose\(\.\.\., {}\(\.\.\.\), L1T"
 LOST = r"\[{}\] under 'l1' are not those that followed from the last step: they were lost"
 
 
@@ -233,7 +233,7 @@ WRONG: dict[str, tuple[Sequence[str], dict[str, Any], type[Exception], str]] = {
             ("transform",),
             {where: [partial(ConditionalPolicySwitch, actor(), lambda data: True)]},
             ValueError,
-            "ConditionalPolicySwitch beside L1Transform lets its policy take steps past it",
+            "ConditionalPolicySwitch beside L1Transform lets its policy bypass it",
         )
         for where in ("before", "after")
     },
@@ -260,25 +260,25 @@ WRONG: dict[str, tuple[Sequence[str], dict[str, Any], type[Exception], str]] = {
         ("transform",),
         {"before": [partial(L1Transform, model, dt=0.05)]},
         ValueError,
-        "has entries under 'l1' already",
+        "already has entries under 'l1'",
     ),
     "state excluded": (
         ("transform",),
         {"after": [partial(ExcludeTransform, "l1")]},
         ValueError,
-        r"takes away \['x_hat', .*'started', 'seal'\] under 'l1'",
+        r"removes \['x_hat', .*'started', 'seal'\] under 'l1'",
     ),
     "part of the state excluded": (
         ("transform",),
         {"after": [partial(ExcludeTransform, ("l1", "q"))]},
         ValueError,
-        r"takes away \['q'\] under 'l1'",
+        r"removes \['q'\] under 'l1'",
     ),
     "part of the state excluded outside": (
         BOTH,
         {"outside": [partial(ExcludeTransform, ("l1", "started"))], **two},
         KeyError,
-        r"found no \['started'\] under 'l1': a transform, a module or a collector took it away",
+        r"found no \['started'\] under 'l1': a transform, a module or a collector removed it",
     ),
     "seal excluded outside": (
         ("transform",),
@@ -410,7 +410,9 @@ def controller(**settings: Any) -> L1Controller:
 def test_two_faces_under_one_name_are_refused() -> None:
     l1, ours = partial(L1Transform, model, dt=0.05), controller()
     for chain in ((l1(), ours.make_primer()), (controller().make_primer(), ours.make_primer())):
-        with pytest.raises(ValueError, match="under 'l1' already, of another controller or primer"):
+        with pytest.raises(
+            ValueError, match="already has entries under 'l1', of another controller or primer"
+        ):
             TransformedEnv(pendulum(), Compose(*chain)).reset()
     # Collectors may add a second primer of one controller.
     twice = TransformedEnv(pendulum(), Compose(ours.make_primer(), ours.make_primer()))

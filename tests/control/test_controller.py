@@ -340,7 +340,7 @@ def test_bounds_and_time_step_come_from_the_environment_or_its_spec():
 
 def test_what_is_not_known_is_asked_for():
     unknown = L1Controller(make_model())
-    with pytest.raises(ValueError, match="knows dt once an environment with its primer"):
+    with pytest.raises(ValueError, match="knows dt only once an environment with its primer"):
         unknown(tensordict(unknown))
     unbounded = L1Controller(make_model(), dt=0.04)
     data = tensordict(unbounded)

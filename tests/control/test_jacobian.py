@@ -272,7 +272,7 @@ def test_every_face_takes_what_the_model_predicts(net):
 
 
 @pytest.mark.parametrize("preset", [L1Config.paper, L1Config.robust])
-@pytest.mark.filterwarnings("ignore:.* knows no covariance")
+@pytest.mark.filterwarnings("ignore:.* finds no covariance")
 def test_a_batch_without_rows_is_no_first_step(net: Net, preset: Callable[..., L1Config]) -> None:
     """Nothing can be told of a model by it; the first one with rows is looked at."""
     jacobian, config = ActionJacobian(net), preset(0.05, action_low=-1.0, action_high=1.0)

@@ -100,7 +100,7 @@ NORMALISED = {
 @pytest.mark.parametrize("name", NORMALISED)
 def test_statistics_that_change_before_l1_are_noticed(face, outside, name):
     make = NORMALISED[name]
-    with pytest.warns(UserWarning, match=f"{name} stands between .* changes its statistics"):
+    with pytest.warns(UserWarning, match=f"{name} stands between .* keeps changing its statistics"):
         with_face(face, make(frozen=False, outside=outside)).reset()
     with_face(face, make(frozen=True, outside=outside)).reset()
 
@@ -113,9 +113,7 @@ def test_statistics_that_change_in_each_environment_are_noticed():
 
 @pytest.mark.parametrize("face", FACES)
 def test_resets_without_a_mask_at_the_root_are_refused(face):
-    with pytest.raises(
-        ValueError, match=r"L1\w+ starts afresh .* resets by \[\('agent', '_reset'\)"
-    ):
+    with pytest.raises(ValueError, match=r"L1\w+ restarts .* resets by \[\('agent', '_reset'\)"):
         with_face(face, Agents(), dt=0.05).reset()
 
 

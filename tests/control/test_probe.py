@@ -229,7 +229,7 @@ def test_what_is_no_prediction_is_named():
             pendulum(model).rollout(2)
     with pytest.raises(ValueError, match=r"returned shape \(2, 1\) for observations"):
         ActionJacobian(lambda x, u: u)(*data(2))
-    with pytest.raises(ValueError, match="predicts what is not finite at the first"):
+    with pytest.raises(ValueError, match="gives a prediction that is not finite at the first"):
         pendulum(lambda x, u: x + u.sum() / 0.0).rollout(2)
 
 
@@ -239,7 +239,7 @@ def test_a_prediction_that_changes_from_call_to_call_is_refused():
 
     torch.manual_seed(0)
     before = torch.random.get_rng_state()
-    with pytest.raises(ValueError, match="something else at each call"):
+    with pytest.raises(ValueError, match="another prediction at each call"):
         ActionJacobian(sampled)(*data(4))
     assert torch.equal(torch.random.get_rng_state(), before)
 
@@ -257,7 +257,7 @@ def test_a_model_that_does_not_use_the_action_is_flagged():
 
 def test_a_model_without_derivative_is_refused():
     weight = torch.ones(N + M, N)
-    with pytest.raises(ValueError, match="its derivative by the action is zero: it is detached"):
+    with pytest.raises(ValueError, match="with respect to the action is zero: it is detached"):
         ActionJacobian(lambda x, u: x + u.detach())(*data(4))
     with pytest.raises(ValueError, match="piecewise constant"):
         ActionJacobian(lambda x, u: x + (10 * u).round())(*data(4))

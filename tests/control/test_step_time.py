@@ -82,7 +82,7 @@ def model(observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
 def test_time_step_of_serial_environments_once_they_run():
     env = SerialEnv(2, partial(skipping, 2))
     augmented = TransformedEnv(env, L1Transform(model))
-    with pytest.raises(ValueError, match="knows dt once an environment is reset"):
+    with pytest.raises(ValueError, match="knows dt only once an environment"):
         augmented.transform.config
     augmented.reset()
     assert augmented.transform.config.dt == pytest.approx(0.1)
@@ -90,7 +90,9 @@ def test_time_step_of_serial_environments_once_they_run():
 
 def test_an_environment_that_does_not_tell():
     env = TransformedEnv(GymWrapper(Silent()), L1Transform(model))
-    with pytest.raises(ValueError, match=r"L1Transform needs dt, .* the environment does not tell"):
+    with pytest.raises(
+        ValueError, match=r"L1Transform needs dt, .* the environment does not declare"
+    ):
         env.transform._complete()
     env = TransformedEnv(GymWrapper(Silent()), L1Transform(model, dt=0.3))
     env.transform._complete()

@@ -53,14 +53,14 @@ def test_a_time_that_goes_back_begins_an_episode(tmp_path: Path) -> None:
     table(tmp_path / "log.csv", [5, 4])
     data = read_csv(tmp_path / "log.csv", **KEYS, time="time")
     assert data.shape == (7,) and data["next", "done"].sum() == 2
-    with pytest.raises(ValueError, match="tells by 'time' of 1 episodes"):  # where it is not named
+    with pytest.raises(ValueError, match="'time' shows 1 episodes"):  # where it is not named
         read_csv(tmp_path / "log.csv", **KEYS)
 
 
 def test_a_gap_is_told_and_not_bridged(tmp_path: Path) -> None:
     lines = [f"{t},{t},0,1" for t in (0.0, 0.1, 0.2, 0.3, 0.5, 0.6, 0.7)]
     file = write(tmp_path / "log.csv", "t,angle,rate,torque", *lines)
-    with pytest.warns(UserWarning, match="1 steps of time are not 0.1 s"):
+    with pytest.warns(UserWarning, match="1 time steps differ from 0.1 s"):
         data = read_csv(file, **KEYS, time="t")
     assert data["dt"][0].item() == pytest.approx(0.1)
     steps = data["next", "observation"][:, 0] - data["observation"][:, 0]
@@ -70,14 +70,14 @@ def test_a_gap_is_told_and_not_bridged(tmp_path: Path) -> None:
 def test_rows_of_one_time_are_a_gap(tmp_path: Path) -> None:
     lines = [f"{t},{t},0,1" for t in (0.0, 0.1, 0.2, 0.2, 0.3, 0.4, 0.5)]
     file = write(tmp_path / "log.csv", "t,angle,rate,torque", *lines)
-    with pytest.warns(UserWarning, match=r"1 steps of time are not 0\.1 s"):
+    with pytest.warns(UserWarning, match=r"1 time steps differ from 0\.1 s"):
         data = read_csv(file, **KEYS, time="t")
     assert len(data) == 5 and data["next", "done"].sum() == 2
     # A table in which every line stands twice would be left without any transition.
     file = write(tmp_path / "log.csv", "t,angle,rate,torque", *(2 * lines[:3]), *(2 * lines[4:]))
     doubled = sorted(file.read_text().splitlines()[1:])
     file = write(tmp_path / "log.csv", "t,angle,rate,torque", *doubled)
-    with pytest.raises(ValueError, match=r"steps of time from 0 to 0\.1 s: resample"):
+    with pytest.raises(ValueError, match=r"time steps from 0 to 0\.1 s: resample"):
         read_csv(file, **KEYS, time="t")
 
 
@@ -118,29 +118,29 @@ def test_columns_padded_with_spaces(tmp_path: Path, delimiter: str, lines: list[
             ["angle;rate;torque", "0;0;0"],
             {},
             KeyError,
-            "only angle;rate;torque, cells .* by ','; give delimiter=';'",
+            "only angle;rate;torque, with cells separated by ','; give delimiter=';'",
         ),
-        (["PAR1\0\0\0"], {}, ValueError, "is no text: save the table as CSV"),
+        (["PAR1\0\0\0"], {}, ValueError, "is not text: save the table as CSV"),
         ([], {}, KeyError, "no first line"),
         (
             ["angle,rate,torque", "0,0,0", "0,off,0"],
             {},
             ValueError,
-            "line 3, column 'rate': 'off' is no number; where there is no value, the cell is empty",
+            "line 3, column 'rate': 'off' is not a number; leave the cell empty if there is no",
         ),
         (
             ["angle;rate;torque", "0;0,5;0"],
             {"delimiter": ";"},
             ValueError,
-            "line 2, column 'rate': '0,5' is no number; decimals stand behind a point",
+            "line 2, column 'rate': '0,5' is not a number; use a point before the decimals",
         ),
         (
             ["angle,rate,torque,t", "0,0,0,2024-03-01T10:00:00"],
             {"time": "t"},
             ValueError,
-            "column 't': '2024-03-01T10:00:00' is no number; a time is a number of seconds",
+            "column 't': '2024-03-01T10:00:00' is not a number; give times in seconds",
         ),
-        (["angle,rate,torque", "0,1_000,0"], {}, ValueError, "'1_000' is no number"),
+        (["angle,rate,torque", "0,1_000,0"], {}, ValueError, "'1_000' is not a number"),
         (
             # As R writes it, with the names of the rows; and with decimal commas.
             ["angle,rate,torque", "1,0,0,0", "2,0,0,0"],
@@ -150,19 +150,24 @@ def test_columns_padded_with_spaces(tmp_path: Path, delimiter: str, lines: list[
         ),
         (["angle\trate\ttorque"], {"delimiter": "\\t"}, ValueError, "delimiter is one character"),
         (["angle,rate,torque,rate", "0,0,0,1"], {}, ValueError, "2 columns 'rate': rename them"),
-        (["angle,rate,torque", f"{10**6 * '0'}"], {}, ValueError, "no table of text: field larger"),
-        (["angle,rate,torque", "0,0,0"], {}, ValueError, "1 rows, of which none follows"),
+        (
+            ["angle,rate,torque", f"{10**6 * '0'}"],
+            {},
+            ValueError,
+            "not a table of text: field larger",
+        ),
+        (["angle,rate,torque", "0,0,0"], {}, ValueError, "1 rows, none of which follows"),
         (
             ["angle,rate,torque,t", *(f"0,0,0,{t}" for t in (0, 1, 3, 4, 9, 11, 17))],
             {"time": "t"},
             ValueError,
-            "steps of time from 1 to 6 s: resample",
+            "time steps from 1 to 6 s: resample",
         ),
         (
             ["angle,rate,torque,t", "0,0,0,5", "0,0,0,5"],
             {"time": "t"},
             ValueError,
-            "time never goes on from one row to the next: sort the rows",
+            "time never increases from one row to the next: sort the rows",
         ),
         (
             ["angle,rate,torque,t", *(f"0,0,0,{t}" for t in (3, 0, 4, 1, 6, 2, 9, 5))],
@@ -174,7 +179,7 @@ def test_columns_padded_with_spaces(tmp_path: Path, delimiter: str, lines: list[
             ["angle,rate,torque,run", *(f"0,0,0,{run}" for run in ("a", "a", "", "b", "", "nan"))],
             {"episode": "run"},
             ValueError,
-            "3 of 6 rows name no episode, row 3 first",
+            "3 of 6 rows name no episode, first row 3",
         ),
     ],
 )
@@ -194,7 +199,7 @@ def test_errors_name_file_and_place(
 def test_other_encodings_are_named(tmp_path: Path) -> None:
     file = tmp_path / "log.csv"
     file.write_bytes("angle,rate,torque,°C\n0,0,0,20\n".encode("cp1252"))
-    with pytest.raises(ValueError, match=r"log\.csv is no text in UTF-8 .*: save it as such"):
+    with pytest.raises(ValueError, match=r"log\.csv is not text in UTF-8 .*: save it as such"):
         read_csv(file, **KEYS)
 
 
@@ -242,7 +247,7 @@ def test_a_last_observation_without_an_action(tmp_path: Path) -> None:
         ({"x": np.zeros((3, 2, 2)), "u": np.zeros(3)}, ValueError, r"'x' has shape \[3, 2, 2\]"),
         ({"x": np.array(["a", "b"]), "u": np.zeros(2)}, ValueError, "'x' has .* type <U1"),
         ({"x": np.zeros(3), "u": np.zeros(5)}, ValueError, "action has 5 rows, the observation 3"),
-        ({"x": np.zeros((0, 2)), "u": np.zeros((0, 1))}, ValueError, "0 rows, of which none"),
+        ({"x": np.zeros((0, 2)), "u": np.zeros((0, 1))}, ValueError, "0 rows, none of which"),
         ({"x": np.zeros(3), "u": np.zeros(3), "t": np.ones((3, 2))}, ValueError, "'t' has 2 col"),
     ],
 )
@@ -258,7 +263,7 @@ def test_arrays_that_do_not_fit(
 def test_other_files_are_no_archives_of_arrays(tmp_path: Path) -> None:
     write(tmp_path / "log.npz", "angle,rate")
     with pytest.raises(
-        ValueError, match=r"log.npz is no readable .npz file: numpy.savez did not w"
+        ValueError, match=r"log.npz is not a readable .npz file: numpy.savez did not w"
     ):
         read_npz(tmp_path / "log.npz", observation="x", action="u")
     ragged = np.array([np.zeros(2), np.zeros(3)], dtype=object)

@@ -20,7 +20,7 @@ def test_ends_of_episodes_are_not_passed_over(tmp_path: Path, name: str) -> None
     np.savez(
         tmp_path / "log.npz", **columns, **{name: ends.astype(bool)}, number=ends.cumsum() - ends
     )
-    message = rf"tells by '{name}' of 1 episodes that end before the last row"
+    message = rf"'{name}' shows 1 episodes that end before the last row"
     for read, file in ((read_csv, table), (read_npz, tmp_path / "log.npz")):
         with pytest.raises(ValueError, match=message):
             read(file, **KEYS)
@@ -42,7 +42,7 @@ def test_ends_within_an_episode_are_not_passed_over(
     table = write(tmp_path / "log.csv", ",".join(columns), *rows)
     np.savez(tmp_path / "log.npz", **columns)
     for read, file in ((read_csv, table), (read_npz, tmp_path / "log.npz")):
-        with pytest.raises(ValueError, match="tells by 'done' of 1 ends within"):
+        with pytest.raises(ValueError, match="'done' shows 1 ends within"):
             read(file, **KEYS, **options)
 
 
@@ -68,9 +68,9 @@ def test_what_else_tells_of_episodes_is_not_passed_over(tmp_path: Path, name: st
     table = write(tmp_path / "log.csv", ",".join(columns), *rows)
     np.savez(tmp_path / "log.npz", **columns)
     for read, file in ((read_csv, table), (read_npz, tmp_path / "log.npz")):
-        with pytest.raises(ValueError, match=f"tells by '{name}' of 1 episodes that end before"):
+        with pytest.raises(ValueError, match=f"'{name}' shows 1 episodes that end before"):
             read(file, **KEYS)
-        with pytest.raises(ValueError, match=f"tells by '{name}' of 1 ends within"):
+        with pytest.raises(ValueError, match=f"'{name}' shows 1 ends within"):
             read(file, **KEYS, time="clock")
         assert len(read(file, **KEYS, episode="number")) == 4
 
@@ -125,7 +125,7 @@ def test_arrays_of_flags_may_lie_on_their_side_and_have_the_name_of_a_measuremen
     np.savez(file, **columns, terminal=np.ones(6), done=ends[None])
     keys = {"observation": ["angle", "terminal"], "action": "torque"}
     assert len(read_npz(file, **keys, episode="part")) == 4
-    with pytest.raises(ValueError, match="tells by 'done' of 1 episodes that end before the last"):
+    with pytest.raises(ValueError, match="'done' shows 1 episodes that end before the last"):
         read_npz(file, **keys)
     np.savez(file, **columns, done=np.where(ends == 1, 1.0, np.nan))
     assert len(read_npz(file, observation="angle", action="torque", episode="part")) == 4
@@ -164,7 +164,9 @@ def test_rows_that_do_not_follow_each_other_are_no_transitions(
         (read_npz, tmp_path / "log.npz", whole),
         (read_npz, tmp_path / "log.npz", parts),
     ):
-        with pytest.raises(ValueError, match=rf"which is not what stands.* \d+ times of {count}:"):
+        with pytest.raises(
+            ValueError, match=rf"which differs from the next row \d+ times out of {count}:"
+        ):
             read(file, **keys, episode=episode)
 
 
@@ -186,5 +188,7 @@ def test_what_followed_may_stand_beside_rows_in_order(tmp_path: Path) -> None:
         next_observations=following[:19].astype(np.float32),
     )
     assert len(read_npz(tmp_path / "log.npz", observation="observations", action="action")) == 19
-    with pytest.raises(ValueError, match=r"'next_angle', which is not .* 1 times of 39: .*episode"):
+    with pytest.raises(
+        ValueError, match=r"'next_angle', which differs .* 1 times out of 39: .*episode"
+    ):
         read_csv(table, **KEYS)

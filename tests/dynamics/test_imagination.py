@@ -409,7 +409,7 @@ def test_a_function_that_writes_to_what_it_is_given_is_named(name: str) -> None:
 
     functions[name] = writes
     start = torch.zeros(2, 2)
-    with pytest.raises(ValueError, match=f"the {name} function writes to what it is given"):
+    with pytest.raises(ValueError, match=f"the {name} function writes to its inputs"):
         imagine(drifting_model(9.0), start=start, horizon=2, action_low=LOW, action_high=HIGH,
                 **functions)  # fmt: skip
 

@@ -93,7 +93,7 @@ def test_data_that_do_not_fit_the_model_are_named() -> None:
         loss(narrow)
     with pytest.raises(ValueError, match=r"'action' is torch.float64, the model torch.float32"):
         loss(data.clone().set("action", data["action"].double()))
-    with pytest.raises(ValueError, match=r"batch size \(2, 4\) must be of \[B\] .* \[3, B\]"):
+    with pytest.raises(ValueError, match=r"batch size \(2, 4\), expected \[B\] .* \[3, B\]"):
         loss(data.reshape(2, 4))
     with pytest.raises(ValueError, match="there are no data"):
         evaluate_members(loss, data[:0])

@@ -71,7 +71,7 @@ def test_all_as_elites_changes_no_bit(form: str) -> None:
 
 @pytest.mark.parametrize(
     ("chosen", "message"),
-    [([], "one member or more"), ([1, 1], "each once"), ([5], "0 to 4"), ([-1, 2], "0 to 4")],
+    [([], "one or more members"), ([1, 1], "each once"), ([5], "0 to 4"), ([-1, 2], "0 to 4")],
 )
 def test_impossible_elites_are_named(chosen: list[int], message: str) -> None:
     model = make()

@@ -81,7 +81,7 @@ def test_settings_of_head_box_and_precision_come_back(tmp_path: Path) -> None:
     assert loaded.network.activation == "silu" and len(loaded.network.weights) == 1
     assert (loaded.box.margin, loaded.action_normalizer.std_floor) == (0.75, 0.5)
     assert loaded.change_normalizer.mean.dtype is torch.float64 and loaded.quality is None
-    with pytest.raises(ValueError, match="holds a EnsembleDynamics, no ControlAffineDynamics"):
+    with pytest.raises(ValueError, match="holds a EnsembleDynamics, not a ControlAffineDynamics"):
         ControlAffineDynamics.load(tmp_path / "model")
 
 

@@ -429,7 +429,7 @@ def test_inputs_that_never_vary_are_ignored_and_told() -> None:
     x[:, 2], u[:, 1] = 5.0, 0.3
     change = torch.cat([0.1 * u[:, :1] - 0.1 * x[:, :2], torch.zeros(500, 1)], -1)
     data = TensorDict({"observation": x, "action": u, ("next", "observation"): x + change}, [500])
-    with pytest.warns(UserWarning, match=r"'action'\[1\] never varies: what it does is not in"):
+    with pytest.warns(UserWarning, match=r"'action'\[1\] never varies, so its effect is not in"):
         model = fit_dynamics(data, hidden=(64,))
     seen, other = x[:5], x[:5] + torch.tensor([0.0, 0.0, 2.0])
     pushed = u[:5] + torch.tensor([0.0, 0.7])

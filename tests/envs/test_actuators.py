@@ -359,7 +359,7 @@ def test_what_steps_the_environment_itself_comes_before_or_around(make, refused,
 def test_a_controller_inside_is_refused(make, auto_unwrap):
     inside = TransformedEnv(BatchedMujocoEnv("inverted_pendulum", 2), OracleTransform())
     outside = TransformedEnv(inside, make(), auto_unwrap=auto_unwrap)
-    with pytest.raises(ValueError, match=r"comes after OracleTransform, so that .*: put A"):
+    with pytest.raises(ValueError, match=r"comes after OracleTransform and so .*: put A"):
         outside.reset()
     model = ActionJacobian(lambda x, u: x + u)
     inside = TransformedEnv(BatchedMujocoEnv("inverted_pendulum", 2), L1Transform(model))

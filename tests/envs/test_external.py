@@ -221,7 +221,7 @@ def test_observations_in_parts_are_chosen_by_name():
         (Box(0, 9, (1,), np.int64), ANY, "as actions"),
         (Box(-np.inf, np.inf, (1,), np.float32), ANY, "unbounded actions"),
         (Box(-3e38, 3e38, (1,), np.float32), ANY, "unbounded actions"),
-        (FORWARD, Box(0, 255, (8, 8, 3), np.uint8), "images.*FlattenObservation makes of tables"),
+        (FORWARD, Box(0, 255, (8, 8, 3), np.uint8), "images.*FlattenObservation makes from tables"),
         (FORWARD, Discrete(4), "as observations"),
         (FORWARD, Dict(camera=Box(0, 255, (8, 8, 3), np.uint8)), "no vectors"),
     ],
@@ -448,7 +448,7 @@ def test_horizons_that_are_none():
 def test_a_batch_of_one_is_not_asked_for_its_members():
     task = task_of(lambda: SerialEnv(1, lambda: GymWrapper(Cart())), horizon=5, dt=0.1)
     assert not task.has_plant and task.environment(2, seed=0).rollout(3).shape == (2, 3)
-    with pytest.raises(ValueError, match="does not tell how long an episode is"):
+    with pytest.raises(ValueError, match="does not declare how long an episode is"):
         task_of(lambda: SerialEnv(1, lambda: GymWrapper(Cart())), horizon=None, dt=0.1)
 
 

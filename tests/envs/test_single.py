@@ -125,7 +125,7 @@ MIXED = Dict(pose=STATE, gripper=Discrete(2), camera=Box(0, 255, (8, 8, 3), np.u
 @pytest.mark.parametrize("around", [lambda make: make, counted])
 def test_parts_that_would_be_left_out_are_named(around):
     for space in (MIXED, Dict(observation=STATE, **{k: MIXED[k] for k in ("gripper", "camera")})):
-        with pytest.raises(ValueError, match=r"gripper, camera are no .*observation_keys=\["):
+        with pytest.raises(ValueError, match=r"gripper, camera are not .*observation_keys=\["):
             task_of(around(lambda space=space: Plant(space)))
     task = task_of(around(lambda: Plant(MIXED)), observation_keys=["pose"])
     assert task.environment(1).rollout(2)["observation"].shape == (1, 2, 2)

@@ -115,5 +115,5 @@ def test_parts_that_would_be_left_out_of_the_state_are_named():
             **InParts.observation_space.spaces, gripper=gymnasium.spaces.Discrete(2)
         )
 
-    with pytest.raises(ValueError, match=r"gripper are no .*observation_keys=\[height,velocity\]"):
+    with pytest.raises(ValueError, match=r"gripper are not .*observation_keys=\[height,velocity\]"):
         environment_source(Gripping).one()

@@ -187,7 +187,7 @@ def test_a_table_needs_names() -> None:
     data = read_dataset("drive.npz", DatasetColumns(["x"], ["u"], episode="run"))
     assert data["observation"].flatten().tolist() == [0, 1, 3, 4]
     np.savez("buffer.npz", observations=np.array([0.0, 5, 2]), u=np.zeros(3), next_obs=np.arange(3))
-    with pytest.raises(ValueError, match="has 'next_obs', which is not what stands in the next"):
+    with pytest.raises(ValueError, match="has 'next_obs', which differs from the next"):
         read_dataset("buffer.npz", DatasetColumns(["observations"], ["u"]))
 
 
@@ -228,7 +228,7 @@ def test_what_is_no_dataset_is_refused_in_one_line(episodes: list[Episode]) -> N
         "nowhere": "torchrl-l1 dataset RUN_DIR nowhere makes one",
         "empty": "holds no dataset",
         "data.txt": "is no dataset: there are .csv",
-        "torn.npz": "no readable .npz file",
+        "torn.npz": "not a readable .npz file",
         "torn.safetensors": "damaged",
         "list.pt": "no dictionary of tensors",
         "flat.pt": r"with 'observation' of shape \[N, n\]",

@@ -1,7 +1,8 @@
 """L1 adaptive control around learned dynamics.
 
-The core is pure (:func:`step`, :func:`augment`); :class:`L1Transform` and :class:`L1Controller`
-put it into an environment or behind a policy. :class:`OracleTransform` bounds what they can do.
+The core is pure functions (:func:`step`, :func:`augment`); :class:`L1Transform` puts them into an
+environment, :class:`L1Controller` behind a policy. :class:`OracleTransform` gives an upper bound on
+what either can achieve.
 """
 
 from torchrl_l1.control.affine import (

@@ -27,16 +27,17 @@ from torchrl_l1.control.signals import (
 from torchrl_l1.control.state import L1Diagnostics, L1State, ResidualStatistics
 
 BLOCK = 128
-"""Rows of a batch that the ensemble evaluates at once on a processor.
+"""Batch rows that the ensemble evaluates at once on a CPU.
 
-With more, the tangents of wide layers do not stay in its cache: 256 rows of five members of 256
-units and six actions are 8 MB. With fewer, a small model would only wait for the next call.
+With more rows, the tangents of wide layers no longer fit in its cache: 256 rows of five members
+with 256 units and six actions take 8 MB. With fewer, a small model spends its time on call
+overhead.
 """
 
 Step = tuple[Tensor, L1State, L1Diagnostics | None]
 Silent = tuple[Tensor, L1State, Callable[[], L1Diagnostics]]
 StepFunction = Callable[[L1State, Tensor, Tensor], Step]
-"""A step of L1: executed input, next state and, if they are computed, diagnostics."""
+"""A step of L1: executed input, next state and, if computed, diagnostics."""
 
 
 class AffineModel(NamedTuple):
@@ -88,13 +89,13 @@ def switching_law(
     action: Tensor,
     epsilon: float,
 ) -> tuple[Tensor, Tensor]:
-    r"""Whether the affine model around ``u_bar`` is too inaccurate at ``action``.
+    r"""Test whether the affine model around ``u_bar`` is too inaccurate at ``action``.
 
-    arXiv 2403.14860, switching condition in section 3.2:
-    :math:`\|\hat f^a(x, u; \bar u) - \hat f(x, u)\| > \epsilon` (printed there with
-    :math:`\ge`), Euclidean norm in raw state units. An error that is not a number does not switch.
+    arXiv 2403.14860, switching condition in section 3.2: :math:`\|\hat f^a(x, u; \bar u) - \hat
+    f(x, u)\| > \epsilon` (printed there with :math:`\ge`), Euclidean norm in raw state units. An
+    error that is NaN does not trigger a switch.
 
-    The affine model is compared at one input only, which takes one directional derivative; the
+    The affine model is compared at a single input, which takes one directional derivative; the
     Jacobian is evaluated once per step, at the operating point that this law selects.
 
     Args:
@@ -130,7 +131,7 @@ def operating_point(
         model: the learned dynamics.
         observation: ``(..., n)``, raw units.
         u_bar: the operating input ``(..., m)``.
-        candidate: the input that takes its place at a switch ``(..., m)``.
+        candidate: the input that replaces it at a switch ``(..., m)``.
         tested: where the affine model around ``u_bar`` is tested ``(..., m)``.
         started: ``(..., 1)`` bool, false where there is nothing to switch from.
         epsilon: tolerance, state units.
@@ -140,7 +141,7 @@ def operating_point(
     """
     remainder, tangent_at = model.expansion(observation, u_bar, candidate, tested)
     switch, error = _exceeds(remainder, epsilon)
-    # Rounding may separate two evaluations at the same input; a first step never switches.
+    # Rounding may make two evaluations at the same input differ; a first step never switches.
     switch = switch & started
     selected = torch.where(switch, candidate, u_bar)
     return switch, error, Affinization(selected, *tangent_at(switch))
@@ -155,23 +156,23 @@ def augment(
 ) -> tuple[Tensor, L1State, L1Diagnostics]:
     """Turn the policy's action into the executed input (arXiv 2403.14860, Algorithms 1 and 2).
 
-    Where the affine model around the remembered operating point fails the switching law at the
-    current observation, the operating point moves to ``u_rl``; the model is affinized at the
-    point selected, and the adaptive law takes its step on it. The first step of an environment
-    chooses its operating point without counting a switch.
+    If the affine model around the current operating point fails the switching law at the current
+    observation, the operating point moves to ``u_rl``. The model is then affinized at the selected
+    point, and the adaptive law takes its step on it. The first step of an environment chooses its
+    operating point without counting a switch.
 
     Args:
         config: the settings.
         model: the learned dynamics.
         state: from :func:`torchrl_l1.control.init` or the previous step.
         observation: ``(..., n)``, raw units.
-        u_rl: the policy's action ``(..., m)``; clipped to the bounds first.
+        u_rl: the policy's action ``(..., m)``; it is clipped to the bounds first.
 
     Returns:
         the executed input ``(..., m)``, the next state and the diagnostics.
 
     Raises:
-        ValueError: if a setting or a shape does not fit the state's.
+        ValueError: if a setting or a shape does not match the state's.
 
     Examples:
         >>> from torchrl_l1.control import init
@@ -195,7 +196,7 @@ def augment_silently(
     observation: Tensor,
     u_rl: Tensor,
 ) -> Silent:
-    """:func:`augment` with the diagnostics as a function, which need not be called."""
+    """:func:`augment` with the diagnostics as a function, to be called only if wanted."""
     config.check_dimensions(state.x_hat.shape[-1], state.q.shape[-1])
     return _LAWS[config.filter](config, model, state, observation, u_rl)
 
@@ -219,7 +220,7 @@ def _augment_low_pass(
         model, observation, u_bar, u_rl, tested, state.started, config.epsilon
     )
     u_bar, change, jacobian = affinization
-    # A prediction that is not finite at the tested input counts like one at the operating point.
+    # A non-finite prediction at the tested input counts like one at the operating point.
     believed = (error < torch.inf) | fresh
     restart = None
     if config.on_switch == "reset":
@@ -256,9 +257,9 @@ def _augment_kalman(
     observation: Tensor,
     u_rl: Tensor,
 ) -> Silent:
-    """:func:`augment_silently` where the input is known before the model is expanded, at it."""
+    """:func:`augment_silently` with the input known before the model is expanded at it."""
     u_rl = saturate(config, u_rl)
-    # What the last step expected does not depend on where this one is.
+    # What the last step expected does not depend on the current input.
     known = model.residual_statistics(observation, u_rl, "residuals")
     estimated = kalman_law.estimate(config, state, observation, known)
     control = kalman_law.adapted(config, estimated, u_rl)
@@ -308,7 +309,7 @@ def _tested_input(
 def _residuals(
     config: L1Config, model: ActionJacobian, observation: Tensor, u_bar: Tensor
 ) -> ResidualStatistics | None:
-    """What the adaptive law weighs by, if it does."""
+    """The residual statistics by which the adaptive law weighs, if it does."""
     if config.estimator != "weighted":
         return None
     return model.residual_statistics(observation, u_bar, config.covariance)
@@ -317,9 +318,9 @@ def _residuals(
 def make_step(
     config: L1Config, model: ActionJacobian, mode: CompileMode, diagnostics: bool = True
 ) -> StepFunction:
-    """The step of L1 as a function of state, observation and action, compiled or not.
+    """Make the step of L1 as a function of state, observation and action, compiled or not.
 
-    Without ``diagnostics`` it returns ``None`` in their place, and does not compute them. Large
+    Without ``diagnostics`` it does not compute them and returns ``None`` in their place. Large
     batches pass in blocks of :data:`BLOCK` rows where the model allows it.
     """
 
@@ -334,22 +335,22 @@ def make_step(
         weighted = config.estimator == "weighted"
         setting = "estimator='weighted'" if weighted else f"filter={config.filter!r}"
         warnings.warn(
-            f"{setting} knows no covariance of {type(model.dynamics).__name__}'s residuals and "
-            "takes the identity: give the model a residual_covariance(observation, action), or fit "
+            f"{setting} finds no covariance of {type(model.dynamics).__name__}'s residuals and "
+            "uses the identity: give the model a residual_covariance(observation, action), or fit "
             "an EnsembleDynamics, which measures its own",
             stacklevel=3,
         )
 
-    # Environments keep their batch size, so graphs with free sizes would only cost: and torch
-    # cannot make dual tensors of them, which forward-mode Jacobians need.
+    # Environments keep their batch size, so dynamic sizes would only cost time, and torch cannot
+    # make dual tensors of them, which forward-mode Jacobians need.
     whole = compiled(cast(FunctionType, step), mode, dynamic=False)
     whole = partial(_in_blocks, whole) if model.blockwise else whole
     return _prepared(whole, config, model)
 
 
 def _prepared(step: StepFunction, config: L1Config, model: ActionJacobian) -> StepFunction:
-    """The step of a model that is looked at before the first one, and after ``train()``."""
-    # Another controller may have looked at the model, but not at what this one asks of it.
+    """The step of a model that is checked before the first step and after ``train()``."""
+    # Another controller may have checked the model, but not for what this one needs of it.
     is_checked = False
 
     def prepared(state: L1State, observation: Tensor, u_rl: Tensor) -> Step:

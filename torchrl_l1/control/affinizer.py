@@ -25,29 +25,30 @@ _STATE = ("u_bar", "started")
 class Affinizer(TensorDictModuleBase):
     r"""Control-affine model ``x' = x + drift + jacobian @ u`` of learned dynamics.
 
-    arXiv 2403.14860, affinization and switching law of section 3.2: the model is expanded to
-    first order in the action around an operating input :math:`\bar u`. With a tolerance
-    ``epsilon`` the operating input is remembered and moves to the action where the expansion
-    errs by more; that memory needs the primer of :meth:`make_primer` in the environment.
-    Without one, each sample is expanded around its own action, which suits stored data.
+    arXiv 2403.14860, affinization and switching law of section 3.2: the model is expanded to first
+    order in the action around an operating input :math:`\bar u`. With a tolerance ``epsilon``, the
+    operating input is kept from step to step and moves to the action where the expansion errs by
+    more than that; the environment then needs the primer of :meth:`make_primer`. Without a
+    tolerance, each sample is expanded around its own action, which suits stored data.
 
-    Writes ``drift`` ``(..., n)`` and ``jacobian`` ``(..., n, m)`` under ``key``; with a tolerance
-    also ``switch`` and ``error`` ``(..., 1)`` there and the next ``u_bar`` and ``started`` under
-    ``("next", key)``.
+    It writes ``drift`` ``(..., n)`` and ``jacobian`` ``(..., n, m)`` under ``key``. With a
+    tolerance it also writes ``switch`` and ``error`` ``(..., 1)`` there, and the next ``u_bar`` and
+    ``started`` under ``("next", key)``.
 
     Args:
         dynamics: the learned model, see :class:`~torchrl_l1.control.ActionJacobian`.
-        epsilon: tolerance in raw state units, or ``None`` to remember nothing.
+        epsilon: tolerance in raw state units, or ``None`` to keep no operating input.
         observation_key: key of the observation.
         action_key: key of the action.
-        key: name of the nested tensordict with the entries written.
-        action_dim: width of the action; needed by :meth:`make_primer` if the model has no
-            attribute of that name.
+        key: name of the nested tensordict for these entries.
+        action_dim: width of the action; :meth:`make_primer` needs it if the model has no attribute
+            of that name.
         predicts: what ``dynamics`` predicts, ``"change"`` or ``"next_observation"``; ``None``
             decides as :class:`~torchrl_l1.control.ActionJacobian` does.
 
     Raises:
-        KeyError: at a call, if the observation, the action or the remembered input is missing.
+        KeyError: on a call, if the observation, the action or the stored operating input is
+            missing.
         ValueError: if ``epsilon`` is negative.
 
     Examples:
@@ -87,10 +88,10 @@ class Affinizer(TensorDictModuleBase):
             self.out_keys += [("next", key, name) for name in _STATE]
 
     def make_primer(self) -> TensorDictPrimer:
-        """Transform that gives the environment the memory of the operating input."""
+        """Transform that carries the operating input from step to step in the environment."""
         if self._action_dim is None:
             raise ValueError(
-                "the primer needs the width of the action, and the model does not tell: give "
+                "the primer needs the width of the action, and the model does not declare it: give "
                 "Affinizer action_dim"
             )
         dtype = self.model.dtype or torch.get_default_dtype()

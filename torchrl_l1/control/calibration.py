@@ -15,27 +15,28 @@ from torchrl_l1.control.signals import saturate
 from torchrl_l1.control.state import L1State, ResidualStatistics, init
 
 INFLATIONS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
-# With the largest a disturbance walks as far in a thousand steps as it is expected to be off zero
-# at a reset. A faster one is followed sooner, but never known well enough to be cancelled whole.
+# With the largest value, a disturbance drifts as far in a thousand steps as it is expected to be
+# from zero at a reset. A faster one is followed sooner, but never known well enough to be cancelled
+# completely.
 PROCESS_NOISES = (0.001, 0.003, 0.01)
-_AS_GOOD = 1.05  # errors this much above the least count as equal to it
-_SETTLED = 10  # steps after a reset that tell more of the initial deviation than of the residuals
+_AS_GOOD = 1.05  # errors up to this factor above the least count as equal to it
+_SETTLED = 10  # steps after a reset that reflect the initial deviation more than the residuals
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a replay of undisturbed episodes says of the Kalman filter's two free numbers.
+    """The Kalman filter's two free settings, found by replaying undisturbed episodes.
 
     Attributes:
-        inflation: the smallest tried with which the estimates of a disturbance that is not there
-            are as large as their posterior says, or the largest if none is.
-        process_noise: with which the executed input errs least; the largest of those that are as
-            good within 5 %, since it notices a change soonest. A fraction of half the range of
-            the action, as in :class:`~torchrl_l1.control.ResidualStatistics`.
-        table: one row per pair tried: ``process_noise``, ``inflation``, ``consistency``, the mean
-            square of the estimates in posterior standard deviations where there is no
-            disturbance, and ``error``, the root mean square of what the input leaves of the
-            disturbance, in half ranges of the action, over undisturbed and disturbed replays.
+        inflation: the smallest value tried for which the estimates of an absent disturbance are no
+            larger than their posterior says; the largest value tried if there is no such value.
+        process_noise: the value for which the executed input errs least; of those that are as good
+            within 5 %, the largest, since it responds soonest to a change. A fraction of half the
+            range of the action, as in :class:`~torchrl_l1.control.ResidualStatistics`.
+        table: one row per pair tried: ``process_noise``, ``inflation``, ``consistency`` (the mean
+            square of the estimates in posterior standard deviations where there is no disturbance)
+            and ``error`` (the root mean square of the disturbance that the input leaves
+            uncancelled, in half ranges of the action, over undisturbed and disturbed replays).
     """
 
     inflation: float
@@ -57,33 +58,32 @@ def calibrate(
 ) -> Calibration:
     r"""Choose inflation and process noise by replaying residuals through the Kalman filter.
 
-    Residuals of a model are neither white nor normal: contacts and what the model lacks come back
-    step after step, and a filter that takes them for independent is sure of disturbances that are
-    not there. What enlargement of their covariance makes its posterior honest is a question of
-    *consistency* (Bar-Shalom, Li and Kirubarajan, 2001, section 5.4): the normalised square of
-    the estimation error :math:`\hat d^2 / P` has mean one. The bandwidth comes from the same
-    episodes with disturbances put in: the filter's initial deviation with random signs, from the
-    reset on in every other stretch and from a random moment on in the others, added to the
+    A model's residuals are neither white nor normal: contacts and whatever else the model lacks
+    recur step after step, and a filter that takes them for independent becomes sure of disturbances
+    that are not there. How much their covariance must be inflated for the posterior to be honest is
+    a question of *consistency* (Bar-Shalom, Li and Kirubarajan, 2001, section 5.4): the normalised
+    square of the estimation error :math:`\hat d^2 / P` has mean one. The bandwidth is found on the
+    same episodes with disturbances added: the filter's initial deviation with random signs, from
+    the reset on in every other stretch and from a random moment on in the rest, added to the
     residuals as :math:`r_t + J_t d_t` within the bounds of the action. Neither needs the real
     system.
 
     Args:
-        config: the settings that the two belong to; those two of its own do not matter.
-        residual: what the model missed in each step of undisturbed episodes ``(S, T, n)``, state
-            units.
-        jacobian: of the model in the same steps ``(S, T, n, m)``.
-        covariance: of the residuals ``(n, n)``, or of each of them ``(S, T, n, n)``.
-        action: that was executed in the same steps ``(S, T, m)``; zero if ``None``.
-        inflations: those tried.
-        process_noises: those tried.
-        generator: of the disturbances put in; one with a fixed seed if ``None``.
+        config: the settings for which to choose the two; its own values of the two are ignored.
+        residual: the model's error in each step of undisturbed episodes ``(S, T, n)``, state units.
+        jacobian: the model's Jacobian in the same steps ``(S, T, n, m)``.
+        covariance: covariance of the residuals ``(n, n)``, or of each of them ``(S, T, n, n)``.
+        action: the executed action in the same steps ``(S, T, m)``; zero if ``None``.
+        inflations: the values to try.
+        process_noises: the values to try.
+        generator: source of the added disturbances; one with a fixed seed if ``None``.
 
     Returns:
-        the two numbers and what they were chosen by.
+        the two settings and the table from which they were chosen.
 
     Raises:
-        ValueError: if there are fewer than 20 steps in the episodes, entries are not finite, the
-            covariance is not positive definite, or the settings have no Kalman filter.
+        ValueError: if the episodes have fewer than 20 steps, an entry is not finite, the covariance
+            is not positive definite, or the settings have no Kalman filter.
 
     Examples:
         >>> generator = torch.Generator().manual_seed(0)
@@ -115,12 +115,12 @@ def calibrate(
         for noise in process_noises
         for inflation in sorted(inflations)
     ]
-    # All pairs side by side: a leading dimension.
+    # All pairs side by side, along a leading dimension.
     noise, inflation = residual.new_tensor([list(pair.values()) for pair in tried]).T
     statistics = ResidualStatistics(
         covariance, inflation[:, None, None, None], noise[:, None, None]
     )
-    # The covariance is at hand, wherever it comes from: none needs to be remembered.
+    # The covariance is given here, wherever it comes from: none needs to be remembered.
     free = replace(config, process_noise=None, inflation=None, covariance="residuals")
     mean, variance = replay(free, residual, jacobian, action, statistics, len(tried))
     posterior = kalman.Posterior(mean, torch.diag_embed(variance))
@@ -143,7 +143,7 @@ def calibrate(
 def _check_recorded(
     config: L1Config, residual: Tensor, jacobian: Tensor, action: Tensor, covariance: Tensor
 ) -> None:
-    """Refuse episodes that the filter cannot be calibrated with; shapes are the Jacobian's."""
+    """Reject episodes unfit for calibration; the shapes follow from the Jacobian."""
     sequences, steps, n, m = jacobian.shape
     if residual.shape != (sequences, steps, n):
         raise ValueError(
@@ -162,7 +162,7 @@ def _check_recorded(
         )
     if not all(values.isfinite().all() for values in (residual, jacobian, action)):
         raise ValueError(
-            "calibration needs finite residuals, Jacobians and actions: leave the others out"
+            "calibration needs finite residuals, Jacobians and actions: leave out all others"
         )
     is_whole = config.estimator == "weighted"
     shapes = (n, n), (sequences, steps, n, n)
@@ -180,7 +180,7 @@ def _honest(table: list[dict[str, float]], process_noise: float) -> dict[str, fl
 
 
 def _steps(sequences: int, steps: int, m: int, generator: torch.Generator) -> Tensor:
-    """Random signs, from the start on or from a random moment of the first half ``(S, T, m)``."""
+    """Random signs, from the start or from a random moment of the first half ``(S, T, m)``."""
     start = torch.randint(0, steps // 2, (sequences, 1, 1), generator=generator)
     start[::2] = 0
     signs = 2.0 * torch.randint(0, 2, (sequences, 1, m), generator=generator) - 1
@@ -195,15 +195,16 @@ def replay(
     statistics: ResidualStatistics,
     candidates: int = 1,
 ) -> tuple[Tensor, Tensor]:
-    """What the Kalman filter makes of recorded residuals: nobody acts on its estimates.
+    """Run the Kalman filter over recorded residuals, without acting on its estimates.
 
     Args:
         config: the settings.
         residual: ``(S, T, n)``, state units.
         jacobian: ``(S, T, n, m)``.
-        action: that was executed ``(S, T, m)``.
-        statistics: of the residuals; what there is one of per candidate has as many leading
-            entries. The covariance is ``(n, n)``, or of each step ``(S, T, n, n)``.
+        action: the executed action ``(S, T, m)``.
+        statistics: statistics of the residuals; entries that differ between candidates have a
+            leading dimension of that size. The covariance is ``(n, n)``, or ``(S, T, n, n)`` with
+            one per step.
         candidates: C.
 
     Returns:
@@ -220,7 +221,7 @@ def replay(
             return statistics
         return statistics._replace(covariance=statistics.covariance[:, t])
 
-    # The first step starts the filter, and knows nothing yet.
+    # The first step only starts the filter, which knows nothing yet.
     estimated = kalman_law.estimate(config, state, zero, known(0))
     means, variances = [], []
     for t in range(steps):
@@ -238,7 +239,7 @@ def _before(
     jacobian: Tensor,
     action: Tensor,
 ) -> L1State:
-    """The state before a residual that this action and Jacobian have led to."""
+    """The state before a residual, which this action and Jacobian have led to."""
     posterior = estimated.posterior
     action = action.expand_as(posterior.mean)
     passed = kalman_law.Reach.of(config, action, posterior).passed

@@ -40,7 +40,7 @@ _CHOICES = {
 
 
 def follows_input(filter: str) -> bool:
-    """Whether the operating point follows the executed input in every step, whatever epsilon.
+    """Whether the operating point follows the executed input in every step, whatever epsilon is.
 
     Examples:
         >>> follows_input("kalman"), follows_input("low_pass")
@@ -53,27 +53,28 @@ def follows_input(filter: str) -> bool:
 class L1Config:
     r"""Settings of the L1 adaptive controller (arXiv 2403.14860, sections 2.2 and 3.2).
 
-    The defaults are those of the paper's Algorithms 1 and 2; :meth:`reference` gives the
-    settings of the authors' released controller, and :meth:`robust` those of the controller
-    that weighs what the model misses by its covariance and acts on what is significant.
+    The defaults are those of the paper's Algorithms 1 and 2. :meth:`reference` gives the settings
+    of the authors' released controller. :meth:`robust` gives a controller that weighs the model's
+    errors by their covariance and acts only on what is significant.
 
     Args:
-        dt: sampling time :math:`T_s`: the time of one environment step, in seconds.
-        epsilon: largest error of the affine model, Euclidean norm in raw state units, before
-            the operating point moves. It depends on the task's scale: the paper uses 0.3 to 3.
+        dt: sampling time :math:`T_s`, the duration of one environment step, in seconds.
+        epsilon: largest error of the affine model, Euclidean norm in raw state units, before the
+            operating point moves. It depends on the scale of the task: the paper uses 0.3 to 3.
         cutoff: cutoff frequency :math:`\omega` of the low-pass filter, in rad/s.
         alpha: filter gain per step, :math:`\alpha = \omega T_s`, in [0, 1]. Give ``cutoff`` or
-            ``alpha`` or neither (then 0.35); 0 estimates without acting.
+            ``alpha`` or neither (the gain is then 0.35); 0 estimates without acting.
         a_s: diagonal of the predictor's Hurwitz matrix :math:`A_s`, in 1/s: one negative number
             or one per observation.
-        on_switch: what a switch does to the predictor and the filter: ``"keep"`` them, as in
-            the paper, or ``"reset"`` both, as the released code.
-        switch_on: the input that the switching law tests: the one ``"executed"`` or that of the
-            ``"policy"``.
-        filter_input: the estimate that the filter takes in: the ``"previous"`` step's, as in
-            the paper's control law, or the ``"current"`` one, as the released code.
+        on_switch: what a switch does to the predictor and the filter: ``"keep"`` them, as in the
+            paper, or ``"reset"`` both, as in the released code.
+        switch_on: the input at which the switching law tests: the ``"executed"`` one or the
+            ``"policy"``'s.
+        filter_input: the estimate that the filter takes in: the ``"previous"`` step's, as in the
+            paper's control law, or the ``"current"`` one, as in the released code.
         action_low: lower bound of the executed action: a number, or a list, array or tensor with
-            one per action dimension, or the bounded spec of the action; ``None`` for no bound.
+            one number per action dimension, or the bounded spec of the action; ``None`` for no
+            bound.
         action_high: upper bound of the executed action, likewise.
         project: whether the matched estimate that enters the filter is projected, entry by
             entry, onto ``[action_low - action_high, action_high - action_low]`` where both are
@@ -85,30 +86,31 @@ class L1Config:
         filter: what turns the estimates of single steps into the adaptive input: the paper's
             ``"low_pass"`` filter, or a ``"kalman"`` filter, whose state is the matched
             disturbance as a random walk, see :mod:`torchrl_l1.control.kalman`. The latter weighs
-            each step by how well the actions can be seen in it and acts on what is significant;
-            it needs no ``cutoff``, ``alpha``, ``a_s`` or ``filter_input``. Its
-            input is known before the model is expanded, so that the operating point moves to the
-            executed input in every step and ``epsilon`` and ``switch_on`` do not matter.
-        covariance: the covariance of the residuals that both use: of the model's validation
-            ``"residuals"``, or of the model at each state and action, from its ``"heads"``, the
-            ``"disagreement"`` of its members or the ``"sum"`` of all three.
-        dead_zone: posterior standard deviations of the disturbance within which the Kalman
-            filter's estimate is not acted on; 0 acts on all of it.
-        process_noise: standard deviation of the disturbance's change per step, as a fraction
-            of half the range of the action (of one action unit without bounds, or with a range
-            beyond 1e9). If ``None``, what the model says of itself, see
-            :func:`~torchrl_l1.control.calibrate`, or else 0.01.
+            each step by how well the actions show in it and acts only on what is significant; it
+            needs no ``cutoff``, ``alpha``, ``a_s`` or ``filter_input``. Its input is known before
+            the model is expanded, so the operating point moves to the executed input in every step,
+            and ``epsilon`` and ``switch_on`` have no effect.
+        covariance: covariance of the residuals for both of these: ``"residuals"``, measured on the
+            model's validation data; or one that depends on state and action, from the model's
+            ``"heads"``, the ``"disagreement"`` of its members, or the ``"sum"`` of all three.
+        dead_zone: number of posterior standard deviations of the disturbance within which the
+            Kalman filter's estimate is not acted on; 0 acts on all of it.
+        process_noise: standard deviation of the disturbance's change per step, as a fraction of
+            half the range of the action (of one action unit without bounds, or with a range beyond
+            1e9). If ``None``, the model's own value, see :func:`~torchrl_l1.control.calibrate`, or
+            else 0.01.
         inflation: factor on the covariance, since residuals are neither white nor normal. If
-            ``None``, what the model says of itself, or else 1.
+            ``None``, the model's own value, or else 1.
         initial_deviation: standard deviation of the disturbance at a reset, in the units of
             ``process_noise``.
-        forgetting: factor per step of the running estimate of how noisy each state is, which
-            notices a sensor that has become noisy; 1 does without.
-        max_error: largest entry of the prediction error that is believed, raw state units, or
-            infinity. Beyond it an observation counts as not finite: L1 stands aside and restarts.
+        forgetting: decay factor per step of the running estimate of each state's noise level, which
+            detects a sensor that has become noisy; 1 turns it off.
+        max_error: largest entry of the prediction error that is believed, in raw state units; may
+            be infinite. Beyond it an observation counts as not finite: L1 stands aside and
+            restarts.
 
     Raises:
-        ValueError: for a setting out of its domain, or settings that exclude each other.
+        ValueError: if a setting is out of its domain, or if settings exclude each other.
 
     Examples:
         >>> L1Config(0.04).filter_gain
@@ -142,7 +144,7 @@ class L1Config:
     max_error: float = 1e8
 
     def __post_init__(self) -> None:
-        # What NumPy and torch call a number, an array or a truth value becomes Python's.
+        # Numbers, arrays and truth values of NumPy and torch become Python's.
         object.__setattr__(self, "project", _as_number(self.project))
         for name in _NUMBERS:
             value = _as_number(getattr(self, name))
@@ -204,7 +206,7 @@ class L1Config:
                 "filter='kalman', whose bandwidth follows from process_noise"
             )
         if self.on_switch == "reset":
-            raise ValueError("filter='kalman' is kept at switches: leave on_switch at 'keep'")
+            raise ValueError("filter='kalman' keeps its state at a switch: use on_switch='keep'")
 
     def _check_predictor(self) -> None:
         for rate in _tuple(self.a_s):
@@ -242,12 +244,12 @@ class L1Config:
 
     @classmethod
     def paper(cls, dt: float, *, epsilon: float = 1.0, **settings: Any) -> L1Config:
-        """The paper's Algorithms 1 and 2: predictor and filter are kept at a switch."""
+        """The paper's Algorithms 1 and 2: a switch keeps predictor and filter."""
         return cls(dt, epsilon=epsilon, **settings)
 
     @classmethod
     def reference(cls, dt: float, *, epsilon: float = 1.0, **settings: Any) -> L1Config:
-        """The authors' released controller: restarted at every switch, no projection."""
+        """The authors' released controller: every switch restarts it, without projection."""
         reference: dict[str, Any] = {
             "on_switch": "reset",
             "switch_on": "policy",
@@ -258,10 +260,10 @@ class L1Config:
 
     @classmethod
     def robust(cls, dt: float, **settings: Any) -> L1Config:
-        """Kalman filter on covariance-weighted residuals, acting on what is significant.
+        """Kalman filter on covariance-weighted residuals that acts only on what is significant.
 
-        Not in the paper: it answers its open question about the covariance of probabilistic
-        models. Inflation and process noise are those of the model, found by
+        Not in the paper: it addresses the paper's open question about the covariance of
+        probabilistic models. Inflation and process noise are the model's own, found by
         :func:`~torchrl_l1.control.calibrate` where there are undisturbed episodes.
         """
         robust: dict[str, Any] = {"estimator": "weighted", "filter": "kalman"}
@@ -278,15 +280,15 @@ class L1Config:
     def matched_bound(self) -> Scalars | None:
         """Largest magnitude of the matched estimate that enters the filter, action units.
 
-        ``action_high - action_low``, infinite where one of them is; ``None`` without bounds or
-        projection.
+        ``action_high - action_low``, infinite where either bound is; ``None`` without bounds or
+        without projection.
         """
         if not self.project or self.action_low is None or self.action_high is None:
             return None
         low, high = self.action_low, self.action_high
         if isinstance(low, tuple) and isinstance(high, tuple):
             return tuple(b - a for a, b in zip(low, high, strict=True))
-        # The configuration expands a number beside a tuple, so both are numbers here.
+        # The configuration expands a number given beside a tuple, so both are numbers here.
         return _tuple(high)[0] - _tuple(low)[0]
 
     @property
@@ -296,24 +298,25 @@ class L1Config:
 
     @property
     def needs_calibration(self) -> bool:
-        """Whether ``inflation`` and ``process_noise`` matter, which a model may know of itself."""
+        """Whether the model's own ``inflation`` and ``process_noise`` may be used."""
         return self.filter == "kalman"
 
     @property
     def needs_covariance(self) -> bool:
-        """Whether the covariance of the model's residuals matters."""
+        """Whether the covariance of the model's residuals is used."""
         return self.needs_calibration or self.estimator == "weighted"
 
     @property
     def covariance_is_late(self) -> bool:
-        """Whether that covariance is asked for at the step after that of the residual."""
+        """Whether that covariance is evaluated one step after the residual's own step."""
         return self.filter == "kalman" and self.covariance == "residuals"
 
     @property
     def half_range(self) -> Scalars:
-        """Half the range of the action, one where a bound is missing or none; action units.
+        """Half the range of the action, in action units; 1 where a bound is missing or infinite.
 
-        Beyond 1e9 it is none: some environments write the largest number for infinity.
+        A range beyond 1e9 counts as infinite: some environments write the largest number for
+        infinity.
         """
         if self.action_low is None or self.action_high is None:
             return 1.0
@@ -334,12 +337,12 @@ class L1Config:
     def predictor_gain(self) -> Scalars:
         r"""Diagonal of what multiplies the prediction error in the predictor's step.
 
-        The adaptation gain less :math:`A_s T_s`: the estimate and the stabilising term together.
+        The adaptation gain minus :math:`A_s T_s`: the estimate and the stabilising term together.
         """
         return _map(lambda rate: _adaptation_gain(rate, self.dt) - self.dt * rate, self.a_s)
 
     def check_dimensions(self, observation_dim: int, action_dim: int) -> None:
-        """Raise ``ValueError`` where a setting given per dimension has the wrong length."""
+        """Raise ``ValueError`` if a setting given per dimension has the wrong length."""
         widths = {"a_s": observation_dim, "action_low": action_dim, "action_high": action_dim}
         for name, width in widths.items():
             value = getattr(self, name)
@@ -351,10 +354,10 @@ class L1Config:
 
 
 def with_open_bounds(config: L1Config, low: Scalars | None, high: Scalars | None) -> L1Config:
-    """The settings with those action bounds filled that they leave open, as from an action spec.
+    """The settings with open action bounds filled in, for example from an action spec.
 
     Args:
-        config: the settings, whose own bounds go first.
+        config: the settings, whose own bounds take precedence.
         low: lower bound; ``None`` leaves it open.
         high: upper bound, likewise.
     """
@@ -364,9 +367,9 @@ def with_open_bounds(config: L1Config, low: Scalars | None, high: Scalars | None
 
 
 def _adaptation_gain(rate: float, dt: float) -> float:
-    # expm1 because exp(z) - 1 loses half the digits at the small z of a fast controller.
+    # expm1, because exp(z) - 1 loses half the digits at the small z of a fast controller.
     z = -rate * dt
-    if not 0 < z < 700:  # the limits, where the quotient has none
+    if not 0 < z < 700:  # beyond these the quotient overflows or is 0 / 0: take the limits
         return 1.0 if z == 0 else 0.0
     return z / math.expm1(z)
 
@@ -376,7 +379,7 @@ def _is_real(value: object) -> bool:
 
 
 def _as_number(value: Any) -> Any:
-    """A number of NumPy's or torch's, or an array with one, as Python's; the rest as it is."""
+    """A NumPy or torch number, or an array that holds one, as a Python number; else unchanged."""
     if type(value) in (int, float, bool) or not hasattr(value, "item"):
         return value
     return value.item() if math.prod(getattr(value, "shape", ())) == 1 else value
@@ -395,7 +398,7 @@ def _as_scalars(name: str, value: Any) -> Scalars | None:
 
 
 def _as_list(name: str, value: Any) -> Any:
-    """Bounds of specs, arrays and tensors as a list; of a batch, if all its rows are the same."""
+    """Bounds from specs, arrays and tensors as a list; batched ones must have equal rows."""
     if name != "a_s":
         space = getattr(value, "space", value)
         value = getattr(space, name.removeprefix("action_"), value)

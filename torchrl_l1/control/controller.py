@@ -1,4 +1,4 @@
-"""The policy-side face of L1: a module that turns the actor's action into the executed input."""
+"""The policy-side form of L1: a module that turns the actor's action into the executed input."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from torchrl_l1.control.step_time import check_time_step
 
 
 class _Environment:
-    """What a controller knows of its environment: told by the primers that it made."""
+    """What a controller knows of its environment, as reported by its primers."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
@@ -60,17 +60,17 @@ class _Environment:
 
     @property
     def config(self) -> L1Config:
-        """The settings, with open bounds filled."""
+        """The settings, with open bounds filled in."""
         config = self.settings.config
         if self._filled is None or self._filled[0] is not config:
             self._filled = config, with_open_bounds(config, self.low, self.high)
         return self._filled[1]
 
     def learn(self, low: Scalars | None, high: Scalars | None) -> None:
-        """Take the bounds of an environment.
+        """Take over the action bounds of an environment.
 
         Raises:
-            ValueError: if another has other ones.
+            ValueError: if another environment reported different bounds.
         """
         if self.is_known and (low, high) != (self.low, self.high):
             raise ValueError(
@@ -81,7 +81,7 @@ class _Environment:
         self._filled = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> _Environment:
-        # Copies of a policy, which collectors make, act in the same environment.
+        # Copies of a policy, as collectors make them, act in the same environment.
         return self
 
     def __getstate__(self) -> dict[str, Any]:
@@ -89,14 +89,14 @@ class _Environment:
 
 
 class L1Primer(TensorDictPrimer):
-    """Starts the state of an :class:`L1Controller` at each reset and carries it on.
+    """Starts the state of an :class:`L1Controller` at each reset and carries it from step to step.
 
-    Made by :meth:`L1Controller.make_primer`. It seals each observation and state, for the
-    controller to check, and tells the controller the environment's action bounds and time step.
+    Made by :meth:`L1Controller.make_primer`. It seals each observation and state for the controller
+    to check, and reports the environment's action bounds and time step to the controller.
 
     Raises:
-        ValueError: at a reset, if the controller's ``dt`` is not the environment's.
-        KeyError: at a step, if the observation is missing, or what the controller wrote.
+        ValueError: at a reset, if the controller's ``dt`` differs from the environment's.
+        KeyError: at a step, if the observation or what the controller wrote is missing.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class L1Primer(TensorDictPrimer):
         self._lacking: list[str] | None = None
 
     def empty_cache(self) -> None:
-        """Forget what the environment told: a transform may have come or gone."""
+        """Forget what the environment reported: a transform may have been added or removed."""
         self._is_checked = False
         self._lacking = None
         super().empty_cache()
@@ -141,7 +141,7 @@ class L1Primer(TensorDictPrimer):
         return super().transform_input_spec(input_spec)
 
     def _adopt_types(self) -> None:
-        """Those of the environment: of its action and, for a model without any, observation."""
+        """Take the action's dtype from the environment, and the model's if the model has none."""
         parent, layout = self.parent, self._layout
         if parent is None:
             return
@@ -163,8 +163,8 @@ class L1Primer(TensorDictPrimer):
         is_there = output_spec["full_observation_spec"].get(self.key, None) is not None
         if is_there and not self._has_a_twin():
             raise ValueError(
-                f"the environment has entries under {self.key!r} already, of another controller or "
-                "primer: leave one of them out, or give L1Controller a key of its own"
+                f"the environment already has entries under {self.key!r}, of another controller or "
+                "primer: leave one of them out, or give L1Controller its own key"
             )
         output_spec = super().transform_output_spec(output_spec)
         observation_spec = output_spec["full_observation_spec"]
@@ -173,7 +173,7 @@ class L1Primer(TensorDictPrimer):
         return output_spec
 
     def _has_a_twin(self) -> bool:
-        """Whether another primer of the same controller, as collectors add one, stands before."""
+        """Whether another primer of this controller comes first, such as one a collector added."""
         chain = chain_of(self)
         before = chain[: next(index for index, member in enumerate(chain) if member is self)]
         return any(isinstance(x, L1Primer) and x._shared is self._shared for x in before)
@@ -186,7 +186,7 @@ class L1Primer(TensorDictPrimer):
         if stepped is not None:
             previous = tensordict.get(self.key).select(*nested.keys(), strict=False)
             nested = nested.where(stepped.reshape(nested.batch_size), previous, pad=0)
-        # The controller knew nothing of the observation to come.
+        # The controller could not know the observation to come.
         nested = nested.clone(False)
         self._seal(nested, next_tensordict)
         return next_tensordict.set(self.key, nested)
@@ -205,7 +205,7 @@ class L1Primer(TensorDictPrimer):
                 f"L1Controller's primer found nothing under {('next', self.key)}: what the "
                 "controller wrote was lost between the policy and the environment"
             )
-        # A step of another policy, as those of random frames: L1 starts after it.
+        # A step of another policy, as with random frames: L1 starts after it.
         nested = tensordict.get(self.key)
         return nested.apply(torch.zeros_like)
 
@@ -252,52 +252,52 @@ class L1Primer(TensorDictPrimer):
 class L1Controller(TensorDictModuleBase):
     """L1 adaptive control after an actor (arXiv 2403.14860, Algorithm 2).
 
-    Reads the observation, the actor's action and the controller's state; replaces the action
-    by the executed input, keeps the actor's under ``(key, "u_rl")`` and writes the next state,
-    the executed input ``u_exec`` and the diagnostics
-    (:class:`~torchrl_l1.control.L1Diagnostics`) under ``("next", key)``. The environment
-    needs the primer of :meth:`make_primer`, which starts the state at each reset and carries
-    it from step to step. No gradient flows through the controller: log-probabilities belong
-    to ``(key, "u_rl")``.
+    It reads the observation, the actor's action and the controller's state. It replaces the action
+    by the executed input, keeps the actor's action under ``(key, "u_rl")``, and writes the next
+    state, the executed input ``u_exec`` and the diagnostics
+    (:class:`~torchrl_l1.control.L1Diagnostics`) under ``("next", key)``. The environment needs the
+    primer of :meth:`make_primer`, which starts the state at each reset and carries it from step to
+    step. No gradient flows through the controller: log-probabilities belong to ``(key, "u_rl")``.
 
-    :class:`~torchrl_l1.control.L1Transform` does the same inside the environment, with ``action``
-    left as the policy's; prefer it unless the environment cannot be wrapped.
+    :class:`~torchrl_l1.control.L1Transform` does the same inside the environment and leaves
+    ``action`` as the policy's; prefer it unless the environment cannot be wrapped.
 
-    The model is referred to, not registered: its weights are not among this module's
-    parameters, and updating them in place is seen at the next step.
+    The model is referenced, not registered: its weights are not among this module's parameters, and
+    in-place updates take effect at the next step.
 
     Args:
         dynamics: the learned model, see :class:`~torchrl_l1.control.ActionJacobian`; an
             ``ActionJacobian`` is used as it is.
-        config: the settings; or give ``dt`` and others of :class:`L1Config`'s here. Action bounds
-            that they leave open are those of ``action_spec`` or else, as soon as it is reset, of
-            the environment that a primer is appended to; infinite ones turn clipping off.
+        config: the settings; alternatively give ``dt`` and other fields of :class:`L1Config` here.
+            Action bounds that they leave open come from ``action_spec`` or else, once it is reset,
+            from the environment that has the primer; infinite bounds turn clipping off.
         dt: time of one environment step in seconds; if ``None``, that of the environment with the
             primer.
-        action_spec: of the action that leaves the controller, such as ``env.action_spec``. It may
-            be needed where policy and environment are copied into another process.
+        action_spec: spec of the action that leaves the controller, such as ``env.action_spec``. It
+            may be needed where policy and environment are copied into another process.
         observation_key: key of the observation.
         action_key: key of the action, replaced by the executed input.
-        key: name of the nested tensordict with the controller's entries.
-        observation_dim: width of the observation; needed by :meth:`make_primer` if the model
-            has no attribute of that name.
+        key: name of the nested tensordict that holds the controller's entries.
+        observation_dim: width of the observation; :meth:`make_primer` needs it if the model has no
+            attribute of that name.
         action_dim: width of the action, likewise.
-        compile: ``True`` compiles the step, ``"auto"`` does so where a compiler works.
+        compile: ``True`` compiles the step, ``"auto"`` does so if a compiler works.
         diagnostics: whether to write the diagnostics.
         predicts: what ``dynamics`` predicts, ``"change"`` or ``"next_observation"``; ``None``
             decides as :class:`~torchrl_l1.control.ActionJacobian` does.
-        out_key: key of the prediction of a model with several, likewise.
-        ensemble_dim: dimension of its output over which the mean is taken, likewise.
-        check_dt: whether ``dt`` must be that of an environment which tells its own.
+        out_key: key of the prediction, for a model with several output keys.
+        ensemble_dim: output dimension over which the mean is taken, for a model that returns one
+            prediction per ensemble member.
+        check_dt: whether ``dt`` must match that of an environment that declares one.
         check: whether each step checks that the observation and the controller's state are those
             that the primer passed on.
         **settings: further fields of :class:`L1Config` (``epsilon``, ``cutoff``, ...).
 
     Raises:
-        KeyError: at a call, if the observation, the action or the controller's state is missing.
+        KeyError: on a call, if the observation, the action or the controller's state is missing.
         ValueError: if a setting, a width or the time step does not fit, or if the observation or
-            the state is not what the primer passed on. Data that are not finite raise nothing:
-            L1 stands aside there and restarts, see :func:`~torchrl_l1.control.law.step`.
+            the state is not what the primer passed on. Non-finite data raise nothing: L1 then
+            stands aside and restarts, see :func:`~torchrl_l1.control.law.step`.
 
     Examples:
         >>> import torch
@@ -368,14 +368,15 @@ class L1Controller(TensorDictModuleBase):
 
     @property
     def config(self) -> L1Config:
-        """The settings, with action bounds and time step of the environment where it told them.
+        """The settings, completed by the environment's action bounds and time step.
 
         Raises:
-            ValueError: if the time step is the environment's and none has told it yet.
+            ValueError: if the time step is the environment's, and no environment has declared it
+                yet.
         """
         if not self._environment.settings.is_complete:
             raise ValueError(
-                "L1Controller knows dt once an environment with its primer, which tells it, is "
+                "L1Controller knows dt only once an environment with its primer declares it and is "
                 "reset: give dt otherwise"
             )
         return self._environment.config
@@ -389,12 +390,12 @@ class L1Controller(TensorDictModuleBase):
         return self.key, "u_rl"
 
     def make_primer(self) -> L1Primer:
-        """Transform that gives the environment the controller's state, zero at every reset."""
+        """Transform that adds the controller's state to the environment, zero at every reset."""
         observation_dim, action_dim = self._dims
         if observation_dim is None or action_dim is None:
             raise ValueError(
                 "the primer needs the widths of observation and action, and the model does not "
-                "tell: give L1Controller observation_dim and action_dim"
+                "declare them: give L1Controller observation_dim and action_dim"
             )
         self._environment.config.check_dimensions(observation_dim, action_dim)
         known = self.model.dtype
@@ -408,13 +409,13 @@ class L1Controller(TensorDictModuleBase):
     make_tensordict_primer = make_primer
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """One step of the controller, see the class."""
+        """Take one step of the controller, see the class."""
         environment, is_eager = self._environment, not torch.compiler.is_compiling()
         action = tensordict.get(self.action_key, None)
         if is_eager and action is not None and action is environment.sent:
             raise ValueError(
                 f"L1Controller is applied again to {self.action_key!r}, its own output: the policy "
-                "holds it twice, or wrote no action before it"
+                "contains it twice, or wrote no action before it"
             )
         ahead = advance(
             self._prepared(),
@@ -442,7 +443,7 @@ class L1Controller(TensorDictModuleBase):
         if self._step is None or config != self._step_config:
             if not self._environment.is_known and None in (config.action_low, config.action_high):
                 warnings.warn(
-                    "L1Controller has no action bounds, and what it sends is not clipped: give it "
+                    "L1Controller has no action bounds, so its output is not clipped: give it "
                     "action_spec=env.action_spec, or infinite action_low and action_high if that "
                     "is meant",
                     UserWarning,
@@ -454,5 +455,5 @@ class L1Controller(TensorDictModuleBase):
         return self._step
 
     def __getstate__(self) -> dict[str, Any]:
-        # Compiled functions do not travel between processes.
+        # Compiled functions cannot be sent to other processes.
         return self.__dict__ | {"_step": None}

@@ -30,13 +30,13 @@ Expansion = tuple[Tensor, Callable[[Tensor], tuple[Tensor, Tensor]]]
 class DynamicsModel(Protocol):
     """What the L1 controller needs of a learned model.
 
-    A model may also have ``value_and_jacobian(observation, action)``, which returns the same
-    change ``(..., n)`` together with its derivative with respect to the action ``(..., n, m)``
-    in raw units; it is then used in place of automatic differentiation. So is
-    ``taylor_remainder(observation, u_bar, action)``, which returns what the tangent at ``u_bar``
-    misses of the change at ``action`` ``(..., n)``, and ``expansion(observation, u_bar,
-    candidate, tested)``, which joins the two, see :meth:`ActionJacobian.expansion`. The controller
-    evaluates the latter in blocks of a batch's rows, each of which must depend on no other.
+    A model may also have ``value_and_jacobian(observation, action)``, which returns the same change
+    ``(..., n)`` together with its derivative with respect to the action ``(..., n, m)`` in raw
+    units. It is then used in place of automatic differentiation. So are two further optional
+    methods: ``taylor_remainder(observation, u_bar, action)``, which returns the difference between
+    the change at ``action`` and the tangent at ``u_bar`` ``(..., n)``, and ``expansion(observation,
+    u_bar, candidate, tested)``, which combines the two, see :meth:`ActionJacobian.expansion`. The
+    controller evaluates the latter in blocks of a batch's rows, so no row may depend on another.
     """
 
     def mean_change(self, observation: Tensor, action: Tensor) -> Tensor:
@@ -50,14 +50,14 @@ class ActionJacobian:
     The Jacobian is analytic where the model has a ``value_and_jacobian`` method. Otherwise the
     m unit tangents of the action are pushed forward through the model on the whole batch
     (forward-mode differentiation under ``vmap``), at the cost of about ``1 + m`` forward passes.
-    Models with a layer that has no forward mode (LSTM, fused attention) take ``n`` backward passes
-    instead, said in a warning. Threads may share a model; they take turns in forward mode.
+    Models with a layer that lacks forward mode (LSTM, fused attention) take ``n`` backward passes
+    instead, with a warning. Threads may share a model; they take turns in forward mode.
 
-    The first use looks at the model once, see :meth:`prepare`. Train mode is refused where a layer
-    is random in it or mixes the rows of a batch (dropout, batch norm).
+    The model is checked once, at its first use, see :meth:`prepare`. Train mode is rejected if it
+    makes a layer random or mixes the rows of a batch (dropout, batch norm).
 
-    The model is referred to, never copied nor registered as a submodule: weights updated in
-    place are seen at the next call, and it keeps its own device and train mode.
+    The model is referenced, never copied or registered as a submodule: in-place updates of its
+    weights take effect at the next call, and it keeps its own device and train mode.
 
     Args:
         dynamics: a :class:`DynamicsModel`, a TensorDictModule that reads ``observation_key``
@@ -66,16 +66,16 @@ class ActionJacobian:
         action_key: key under which it reads the action.
         out_key: key of its prediction; needed if it has several output keys.
         predicts: whether it predicts the ``"change"`` of state or the ``"next_observation"``. If
-            ``None``, the key that a TensorDictModule writes tells: a name with ``change``,
-            ``delta`` or the like means the former; one under ``"next"``, with ``next`` in it, or
-            that of the observation, the latter; any other is refused. A model without keys predicts
-            the change.
-        ensemble_dim: dimension of its output over which the mean is taken, for a module that
-            returns one prediction per ensemble member.
+            ``None``, the key that a TensorDictModule writes decides: a name with ``change``,
+            ``delta`` or the like means the former; a key under ``"next"``, with ``next`` in its
+            name, or equal to that of the observation means the latter; any other is rejected. A
+            model without keys predicts the change.
+        ensemble_dim: output dimension over which the mean is taken, for a module that returns one
+            prediction per ensemble member.
 
     Raises:
         TypeError: if ``dynamics`` is none of the above.
-        ValueError: if the options do not fit the model, or do not tell what it predicts.
+        ValueError: if the options do not fit the model, or do not determine what it predicts.
 
     Examples:
         >>> jacobian = ActionJacobian(lambda x, u: 0.1 * x + u.square() @ torch.ones(1, 3))
@@ -138,7 +138,7 @@ class ActionJacobian:
 
     @property
     def dtype(self) -> torch.dtype | None:
-        """Type of the model's floating-point parameters, ``None`` if it has none."""
+        """Type of the model's floating-point parameters; ``None`` if it has none."""
         if isinstance(self.dynamics, nn.Module):
             for parameter in self.dynamics.parameters():
                 if parameter.is_floating_point():
@@ -146,7 +146,7 @@ class ActionJacobian:
         return None
 
     def check_dimensions(self, observation_dim: int, action_dim: int) -> None:
-        """Raise ``ValueError`` if the model declares other widths than these."""
+        """Raise ``ValueError`` if the model declares widths other than these."""
         for name, width in (("observation_dim", observation_dim), ("action_dim", action_dim)):
             declared = getattr(self.dynamics, name, None)
             if isinstance(declared, int) and declared != width:
@@ -157,26 +157,26 @@ class ActionJacobian:
 
     @property
     def ready(self) -> bool:
-        """Whether the model has been looked at, and not been put into another mode since."""
+        """Whether the model has been checked and not changed mode since."""
         training = getattr(self.dynamics, "training", None)
         return self._mode is not None and training is self._training
 
     def prepare(self, observation: Tensor, action: Tensor) -> None:
-        """Look at the model before its first use, and after ``train()`` and ``eval()``.
+        """Check the model before its first use, and after ``train()`` and ``eval()``.
 
-        One plain call gives lazy layers their weights; then what L1 asks of a model is tried on
-        these data: a finite prediction of the right type and shape, the same at each call and
-        whatever the other rows of the batch are, with a derivative. No global random number is
-        drawn. A model that is :attr:`ready` is left alone; of a batch without rows nothing can be
-        told, so the next one is looked at.
+        One plain call gives lazy layers their weights. The model is then checked on these data: its
+        prediction must be finite, of the right type and shape, the same at each call, independent
+        of the other rows of the batch, and differentiable. The global random state stays untouched.
+        A model that is :attr:`ready` is not checked again; a batch without rows shows nothing, so
+        the check waits for the next one.
 
         Args:
             observation: ``(..., n)`` of a first step.
             action: ``(..., m)``.
 
         Raises:
-            TypeError: if the prediction is no tensor of the observation's type.
-            ValueError: if the model does not keep one of the above.
+            TypeError: if the prediction is not a tensor of the observation's type.
+            ValueError: if the model fails one of these checks.
             RuntimeError: if it cannot be differentiated.
         """
         with FORWARD_MODE:
@@ -194,7 +194,7 @@ class ActionJacobian:
             self._mode, self._training = mode, training
 
     def _lift(self, observation: Tensor, action: Tensor) -> None:
-        """Find out whether the model insists on a batch dimension, as batch norm does."""
+        """Find out whether the model requires a batch dimension, as batch norm does."""
         if observation.ndim > 1:
             return
         refuse_training(self.dynamics)
@@ -215,19 +215,19 @@ class ActionJacobian:
         return self._change(self._predict(observation, action), observation, action)
 
     def _first_value(self, observation: Tensor, action: Tensor) -> Tensor:
-        """:meth:`value`, with a word on the model where it cannot be called."""
+        """:meth:`value`, with an error that names the model if it cannot be called."""
         if self._lifted and observation.ndim == 1:
             return self._first_value(observation.unsqueeze(0), action.unsqueeze(0)).squeeze(0)
         try:
             prediction = self._predict(observation, action)
-        except Exception as error:  # of a model that is made for something else, anything
+        except Exception as error:  # a model made for something else may raise anything
             raise failure(self.dynamics, observation, action, error) from error
         return self._change(prediction, observation, action)
 
     def _first_analytic_value(self, observation: Tensor, action: Tensor) -> Tensor:
         try:
             return self._analytically(observation, action)[0]
-        except RuntimeError as error:  # torch's, as of a model of another type
+        except RuntimeError as error:  # torch's, for example from a model of another type
             raise failure(self.dynamics, observation, action, error) from error
 
     def _change(self, prediction: Tensor, observation: Tensor, action: Tensor) -> Tensor:
@@ -283,10 +283,10 @@ class ActionJacobian:
     __call__ = value_and_jacobian
 
     def taylor_remainder(self, observation: Tensor, u_bar: Tensor, action: Tensor) -> Tensor:
-        r"""What the tangent at ``u_bar`` misses of the change at ``action``: ``(..., n)``.
+        r"""Error of the tangent at ``u_bar`` in predicting the change at ``action``: ``(..., n)``.
 
         This is :math:`\hat f(x, u) - \hat f(x, \bar u) - J(x, \bar u)(u - \bar u)`. It needs one
-        product with the Jacobian and not the Jacobian.
+        product with the Jacobian, not the Jacobian itself.
         """
         analytic = getattr(self.dynamics, "taylor_remainder", None)
         if callable(analytic):
@@ -309,11 +309,12 @@ class ActionJacobian:
         Args:
             observation: ``(..., n)``, raw units.
             action: ``(..., m)``, raw units.
-            source: one of :attr:`L1Config.covariance`'s.
+            source: one of the values of :attr:`L1Config.covariance`.
 
         Returns:
-            those of the model's ``residual_statistics``; else the covariance that its
-            ``residual_covariance`` gives; else that of white residuals of unit variance.
+            those from the model's ``residual_statistics`` or, without that method, the covariance
+            from its ``residual_covariance``; without either, those of white residuals of unit
+            variance.
         """
         known = getattr(self.dynamics, "residual_statistics", None)
         if callable(known):
@@ -326,7 +327,7 @@ class ActionJacobian:
 
     @property
     def blockwise(self) -> bool:
-        """Whether a batch may be evaluated in parts: the model has an ``expansion``."""
+        """Whether a batch may be evaluated in parts, which a model with an ``expansion`` allows."""
         return callable(getattr(self.dynamics, "expansion", None))
 
     def expansion(
@@ -335,8 +336,8 @@ class ActionJacobian:
         """:meth:`taylor_remainder` at ``tested``, then the tangent at ``u_bar`` or ``candidate``.
 
         Returns:
-            what the tangent at ``u_bar`` misses at ``tested`` ``(..., n)``, and a function of a
-            mask ``(..., 1)``, true where the candidate is selected, that returns
+            the error of the tangent at ``u_bar`` at ``tested`` ``(..., n)``, and a function that
+            takes a mask ``(..., 1)``, true where the candidate is selected, and returns
             :meth:`value_and_jacobian` there.
         """
         if self.blockwise:
@@ -371,9 +372,10 @@ class ActionJacobian:
             )
 
         basis = torch.eye(action.shape[-1], dtype=action.dtype, device=action.device)
-        # The value does not depend on the tangent: it comes out once, without a new dimension. Nor
-        # does the tangent's image where the action has no effect, which torch cannot put last.
-        # Within a transform of the caller's, torch takes its dimension for one of the tangent's.
+        # The value does not depend on the tangent, so it is returned once, without a new dimension.
+        # The same holds for the tangent's image where the action has no effect; torch cannot put
+        # its dimension last. Inside a transform of the caller's, torch mistakes that one's
+        # dimension for the tangent's.
         is_inner = _is_traced() and not torch.compiler.is_compiling()
         out_dims: Any = (0 if is_inner else None, 0)
         value, jacobian = _pushed_forward(
@@ -388,7 +390,7 @@ class ActionJacobian:
             basis = torch.eye(value.shape[-1], dtype=value.dtype, device=value.device)
             rows = [pull_back(row.expand_as(value))[0] for row in basis.unbind(0)]
             return value, torch.stack(rows, -2)
-        # torch's function transforms lack layers that plain reverse mode has.
+        # torch's function transforms do not support all layers that plain reverse mode does.
         with torch.inference_mode(False), torch.enable_grad():
             u = action.detach().clone().requires_grad_()
             value = self.value(observation.detach().clone(), u)
@@ -409,13 +411,13 @@ def _gradient(output: Tensor, u: Tensor, *, retain_graph: bool) -> Tensor:
 
 
 def _is_traced() -> bool:
-    """Whether a compiler looks on, or one of torch's function transforms."""
+    """Whether a compiler or one of torch's function transforms is tracing."""
     return torch.compiler.is_compiling() or torch._C._functorch.peek_interpreter_stack() is not None
 
 
 def _pushed_forward(compute: Callable[[], Any]) -> tuple[Tensor, Tensor]:
-    """Two results of forward mode, for one thread at a time."""
-    if torch.compiler.is_compiling():  # traced, there are no levels left
+    """Two results of forward mode, computed by one thread at a time."""
+    if torch.compiler.is_compiling():  # when traced, no levels remain
         value, tangent = compute()
     else:
         with FORWARD_MODE:
@@ -424,9 +426,8 @@ def _pushed_forward(compute: Callable[[], Any]) -> tuple[Tensor, Tensor]:
 
 
 def _load_forward_mode() -> None:
-    # The first jvp of a process loads torch's decompositions, which warn of torch's own
-    # deprecations. Get that over with here, where it can be silenced without hiding anything
-    # that the model itself may warn of.
+    # The first jvp of a process loads torch's decompositions, which warn of deprecations in torch
+    # itself. Do it here, where it can be silenced without hiding a warning of the model's own.
     with FORWARD_MODE, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.func.jvp(torch.sin, (torch.zeros(()),), (torch.ones(()),))

@@ -39,9 +39,9 @@ def factor(covariance: Tensor, units: Tensor | None = None) -> Tensor:
     r"""Cholesky factor :math:`L` of a covariance ``(..., m, m)``.
 
     Args:
-        covariance: positive definite but for rounding.
-        units: what one is of each entry ``(m,)``, where they are of different sizes: the digits of
-            the small ones would be lost beside the large ones.
+        covariance: positive definite up to rounding.
+        units: the unit of each entry ``(m,)``, where their sizes differ: the small entries would
+            otherwise lose their digits beside the large ones.
     """
     if units is None:
         return torch.linalg.cholesky_ex(_bolstered(covariance))[0]
@@ -54,15 +54,14 @@ def measurement_update(
 ) -> Posterior:
     r"""Condition the disturbance on ``innovation = jacobian (d - mean) + white noise``.
 
-    With :math:`P = L L^\top`, white measurements of unit variance and
-    :math:`M = I + (J L)^\top J L = C C^\top`, the posterior covariance is
-    :math:`(C^{-1} L^\top)^\top C^{-1} L^\top`: positive semi-definite whatever the rounding, and
-    without an inverse of the size of the observation.
+    With :math:`P = L L^\top`, white measurements of unit variance and :math:`M = I + (J L)^\top J L
+    = C C^\top`, the posterior covariance is :math:`(C^{-1} L^\top)^\top C^{-1} L^\top`. It is
+    positive semi-definite whatever the rounding and needs no inverse of the observation's size.
 
     Args:
         prior: mean and positive definite covariance.
         jacobian: whitened input matrix ``(..., n, m)``.
-        innovation: whitened residual less what the prior expects ``(..., n)``.
+        innovation: whitened residual minus what the prior expects ``(..., n)``.
         root: :func:`factor` of the prior's covariance, if known.
 
     Returns:
@@ -84,8 +83,8 @@ def measurement_update(
 
 
 def _bolstered(covariance: Tensor) -> Tensor:
-    # Directions that were seen well beside some that never were have variances whose ratio may
-    # be beyond the type's digits.
+    # Beside directions that were never seen, well observed ones may make variances whose ratio is
+    # beyond the type's digits.
     least = 8 * torch.finfo(covariance.dtype).eps
     trace = covariance.diagonal(dim1=-2, dim2=-1).mean(-1)
     eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
@@ -99,22 +98,22 @@ def noise_ratio(
     left: Tensor,
     unknown: Tensor | None = None,
 ) -> Tensor:
-    r"""How much larger than expected one residual's squares are, state by state: ``(..., n)``.
+    r"""Ratio of one residual's squares to those expected, state by state: ``(..., n)``.
 
     :math:`((r - J d)_i^2 + (J P J^\top)_{ii}) / \Lambda_{ii}` with the posterior mean and
-    covariance of the disturbance: the E step of expectation maximisation, in which what the
-    disturbance explains is no noise and what is not known of it counts as expected. The share that
-    effects of another kind explain is taken out likewise.
+    covariance of the disturbance. This is the E step of expectation maximisation: what the
+    disturbance explains is not noise, and the part of it that remains unknown counts as expected.
+    The share that effects of another kind explain is removed likewise.
 
     Args:
         covariance: expected covariance of the residual :math:`\Lambda` ``(..., n, n)``.
         jacobian: ``(..., n, m)``.
-        posterior: of the disturbance, this residual included.
-        left: what it leaves unexplained of the residual, :math:`r - J d` ``(..., n)``.
+        posterior: posterior of the disturbance, this residual included.
+        left: the part of the residual it leaves unexplained, :math:`r - J d` ``(..., n)``.
         unknown: a factor of the covariance of other effects ``(..., n, k)``.
 
     Returns:
-        the ratios ``(..., n)``; their mean is one where the expectation is right.
+        the ratios ``(..., n)``; their mean is one if the expectation is right.
     """
     unseen = ((jacobian @ posterior.covariance) * jacobian).sum(-1)
     variance = covariance.diagonal(dim1=-2, dim2=-1)
@@ -129,15 +128,15 @@ def noise_ratio(
 def doubt(jacobian: Tensor, innovation: Tensor, change: Tensor) -> Tensor:
     r"""Factor on the covariance of one residual that is larger than expected: ``(..., 1)``.
 
-    The mean square of what an update leaves unexplained, in white coordinates, and never below one:
-    the weight of an observation with heavy-tailed noise, of one step of iteratively reweighted
-    least squares. Contacts that the model misses, and the first steps of a sensor that is worse
-    than expected, would otherwise be taken for a disturbance with confidence.
+    The mean square of what an update leaves unexplained, in white coordinates, but at least one:
+    the weight of an observation with heavy-tailed noise, from one step of iteratively reweighted
+    least squares. Without it, contacts that the model misses, and the first steps of a sensor that
+    is worse than expected, would confidently be taken for a disturbance.
 
     Args:
         jacobian: whitened input matrix ``(..., n, m)``.
-        innovation: whitened ``(..., n)``.
-        change: of the disturbance's mean by the update ``(..., m)``.
+        innovation: whitened innovation ``(..., n)``.
+        change: change of the disturbance's mean by the update ``(..., m)``.
     """
     left = innovation - (jacobian @ change.unsqueeze(-1)).squeeze(-1)
     return left.square().mean(-1, keepdim=True).clamp_min(1.0)
@@ -146,11 +145,11 @@ def doubt(jacobian: Tensor, innovation: Tensor, change: Tensor) -> Tensor:
 def significant(posterior: Posterior, dead_zone: float) -> Tensor:
     r"""The part of the disturbance that is acted on, entry by entry: ``(..., m)``.
 
-    :math:`d \max(0, 1 - (z s / |d|)^2)` with :math:`s` the posterior standard deviation: nothing
+    :math:`d \max(0, 1 - (z s / |d|)^2)` with :math:`s` the posterior standard deviation: zero
     within ``dead_zone`` standard deviations, nearly all of it far beyond.
 
     Args:
-        posterior: of the disturbance.
+        posterior: posterior of the disturbance.
         dead_zone: :math:`z`; zero acts on the whole mean.
 
     Examples:
@@ -164,7 +163,7 @@ def significant(posterior: Posterior, dead_zone: float) -> Tensor:
 
 
 def summary(posterior: Posterior) -> tuple[Tensor, Tensor]:
-    """Norm of the standard deviations, and the mean's largest entry in them, each ``(..., 1)``."""
+    """Norm of the standard deviations and the mean's largest entry in them, ``(..., 1)`` each."""
     deviation = posterior.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     limits = torch.finfo(deviation.dtype)
     relative = (posterior.mean.abs() / deviation.clamp_min(limits.tiny)).clamp_max(limits.max)

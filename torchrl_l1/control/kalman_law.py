@@ -26,23 +26,24 @@ from torchrl_l1.control.signals import (
 from torchrl_l1.control.state import L1State, ResidualStatistics
 
 CONTRADICTION = 1.0
-"""Standard deviations beyond which a push inwards at a bound is taken for no noise.
+"""Standard deviations beyond which an inward push at a bound does not count as noise.
 
-Of the inflated covariance, of which ordinary residuals are well within. More would leave weak
-evidence out; with less, noise at the bounds draws the estimate of a bias towards zero.
+These are standard deviations of the inflated covariance, well beyond ordinary residuals. A larger
+value would ignore weak evidence; with a smaller one, noise at the bounds pulls the estimate of a
+bias towards zero.
 """
 
 
 class Estimate(NamedTuple):
-    """What the Kalman filter knows before it says what to do.
+    """What the Kalman filter knows before it decides what to do.
 
     Attributes:
-        posterior: of the matched disturbance; zero where it is not finite.
-        noise: running ratios of the residuals' squares to those expected ``(..., n)``.
-        innovation: what the prediction missed ``(..., n)``, state units.
-        residual: what the model missed ``(..., n)``: the innovation and what was expected of
-            the disturbance.
-        effect_matched: what of it the posterior explains ``(..., n)``.
+        posterior: posterior of the matched disturbance; zero where it is not finite.
+        noise: running ratios of the residuals' squares to their expected values ``(..., n)``.
+        innovation: the prediction's error ``(..., n)``, state units.
+        residual: the model's error ``(..., n)``: the innovation plus the effect expected of the
+            disturbance.
+        effect_matched: the part of it that the posterior explains ``(..., n)``.
         finite: whether all of this is finite ``(..., 1)``, bool.
     """
 
@@ -55,20 +56,19 @@ class Estimate(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """What of a disturbance comes through to a plant whose actuators end at the action's bounds.
+    """The part of a disturbance that reaches a plant whose actuators end at the action's bounds.
 
-    Whether they do is not known: a bias of a motor's command is cut off by the motor's limit, a
-    load on its axis is not. What would lie beyond is expected to be cut off, as in most
-    simulators, and may be there all the same: no reason to take it for noise, and none to learn
-    from it. A push inwards is of another kind: no disturbance beyond a bound explains it, see
-    :meth:`counting`.
+    Whether it is cut off there is not known: a motor's limit cuts off a bias of its command but not
+    a load on its axis. What would lie beyond is expected to be cut off, as in most simulators, but
+    may be present all the same: that is no reason to take it for noise, and none to learn from it.
+    An inward push is different: no disturbance beyond a bound explains it, see :meth:`counting`.
 
     Attributes:
-        passed: what of the mean stays within the bounds ``(..., m)``, action units.
-        within: entries whose whole effect is sure ``(..., m)``, bool.
-        deviation: standard deviation of what comes beside ``passed`` in the others, if anything
-            does, ``(..., m)``; zero for those within.
-        outward: the direction of the bound, one or minus one ``(..., m)``; of no meaning for those
+        passed: the part of the mean that stays within the bounds ``(..., m)``, action units.
+        within: entries whose whole effect is certain ``(..., m)``, bool.
+        deviation: standard deviation of what, in the other entries, may act in addition to
+            ``passed`` ``(..., m)``; zero for those within.
+        outward: direction of the bound, one or minus one ``(..., m)``; meaningless for entries
             within.
     """
 
@@ -79,27 +79,27 @@ class Reach(NamedTuple):
 
     @classmethod
     def of(cls, config: L1Config, executed: Tensor, posterior: Posterior) -> Reach:
-        """For an executed input ``(..., m)`` and what is known of the disturbance."""
+        """From an executed input ``(..., m)`` and what is known of the disturbance."""
         mean = posterior.mean
         both = executed + mean
         passed = saturate(config, both) - executed
-        # No smaller than rounding: actions without bounds may be large.
+        # No smaller than rounding: unbounded actions may be large.
         rounding = 64 * torch.finfo(mean.dtype).eps * both.abs()
         margin = 1e-3 * like(mean, config.half_range) + rounding
         above, below = saturate(config, both + margin), saturate(config, both - margin)
-        # Rounding may take some of twice the margin, a bound takes at least half.
+        # Rounding may remove up to twice the margin, a bound removes at least half.
         within = above - below > 1.5 * margin
         outward = ((both - below) - (above - both)).sign()
         variance = posterior.covariance.diagonal(dim1=-2, dim2=-1) + (mean - passed).square()
         return cls(passed, within, variance.sqrt().masked_fill(within, 0.0), outward)
 
     def counting(self, columns: Tensor, innovation: Tensor) -> Reach:
-        r"""With those entries within whose actuator is pushed inwards, against the expectation.
+        r"""Count entries as within if their actuator is pushed inwards, against expectation.
 
         Where actuators push too little at both bounds, as under a dead zone or a lower gain, the
-        steps at one bound alone would confirm whichever sign the estimate took first. Such are
-        entries with :math:`z_i = (C^\top r)_i / \sqrt{(C^\top C)_{ii}}` of more than
-        :data:`CONTRADICTION` inwards.
+        steps at one bound alone would confirm whichever sign the estimate took first. An entry
+        counts as pushed inwards if :math:`z_i = (C^\top r)_i / \sqrt{(C^\top C)_{ii}}` exceeds
+        :data:`CONTRADICTION` in that direction.
 
         Args:
             columns: whitened input matrix :math:`C` ``(..., n, m)``.
@@ -118,9 +118,9 @@ def estimate(
     residuals: ResidualStatistics | None = None,
     restart: Tensor | None = None,
 ) -> Estimate:
-    r"""What the observation tells of the matched disturbance: one step of a Kalman filter.
+    r"""Estimate the matched disturbance from the observation: one step of a Kalman filter.
 
-    The disturbance :math:`d` is a random walk, seen through the last step's Jacobian in the
+    The disturbance :math:`d` is a random walk, observed through the last step's Jacobian in the
     model's residual:
 
     .. math::
@@ -129,13 +129,12 @@ def estimate(
         x_t - x_{t-1} - \hat f(x_{t-1}, u_{t-1}) = J_{t-1} d_t + w_t, \quad
         w_t \sim N(0, D_t \Lambda D_t)
 
-    where the input and what adds to it stay within the bounds of the action; what lies beyond may
-    reach the plant or not, and counts only where it is contradicted, see :class:`Reach`. Here
+    if the input plus the disturbance stays within the bounds of the action. What lies beyond may or
+    may not reach the plant, and counts only where it is contradicted, see :class:`Reach`. Here
     :math:`\Lambda` is the inflated covariance of the residuals. The squares of the diagonal
-    :math:`D_t` are a running mean of :func:`~.kalman.noise_ratio`, none below one, times their
-    mean over the states: a state whose sensor has become noisy loses its weight, and all do where
-    many have. A single residual beyond expectation loses it at once, see
-    :func:`~.kalman.doubt`.
+    :math:`D_t` are running means of :func:`~.kalman.noise_ratio`, none below one, times their mean
+    over the states: a state whose sensor has become noisy loses weight, and all states do if many
+    have. A single residual beyond expectation loses weight at once, see :func:`~.kalman.doubt`.
 
     Args:
         config: the settings.
@@ -145,10 +144,10 @@ def estimate(
         restart: as in :func:`step`.
 
     Returns:
-        the posterior and what led to it.
+        the posterior and the terms that led to it.
 
     Raises:
-        ValueError: if the state is that of other settings.
+        ValueError: if the state was made with other settings.
     """
     state, observation = wide_state(state), wide(observation)
     past = _memory(config, state)
@@ -172,8 +171,8 @@ def estimate(
     covariance = _expected_covariance(config, state, statistics, fresh)
     noise = past.noise.masked_fill(fresh, 1.0)
     larger = noise.clamp_min(1.0)
-    # From observations that are noisier than its data were, a model errs in a lasting way too: the
-    # policy reacts to the noise, and the mean of a nonlinear function is not that of its argument.
+    # With observations noisier than its data, a model also errs persistently: the policy reacts to
+    # the noise, and the mean of a nonlinear function is not that of its argument.
     scale = (larger * larger.mean(-1, keepdim=True)).sqrt().unsqueeze(-1)
     relative = innovation.unsqueeze(-1) / scale
     columns, white = whitened(covariance, seen / scale, relative)
@@ -188,7 +187,7 @@ def estimate(
     factor = kalman.factor(prior.covariance, half_range if has_units else None)
     posterior = kalman.measurement_update(prior, columns, white, factor)
     if config.forgetting < 1:
-        # A residual far beyond what is expected counts for as much less, at once.
+        # A residual far beyond expectation loses that much weight at once.
         doubt = kalman.doubt(columns, white, posterior.mean - prior.mean).sqrt()
         columns, white = columns / doubt.unsqueeze(-1), white / doubt
         posterior = kalman.measurement_update(prior, columns, white, factor)
@@ -207,7 +206,7 @@ def estimate(
 
 
 def adapted(config: L1Config, estimated: Estimate, u_rl: Tensor) -> ControlInput:
-    """The input that cancels what of an estimate is significant, within the bounds."""
+    """The input that cancels the significant part of an estimate, within the bounds."""
     q = kalman.significant(estimated.posterior, config.dead_zone)
     return ControlInput.of(config, wide(u_rl), q)
 
@@ -228,18 +227,18 @@ def follow(
 
     Args:
         config: the settings.
-        state: that the estimate was made of.
+        state: the state from which the estimate was made.
         estimated: the estimate.
         observation: as in :func:`step`.
         u_rl: the policy's action within its bounds ``(..., m)``.
-        change: of the model at ``u_bar`` ``(..., n)``, state units per step.
+        change: predicted change at ``u_bar`` ``(..., n)``, state units per step.
         jacobian: as in :func:`step`.
         u_bar: operating point ``(..., m)``; zero if ``None``.
         residuals: as in :func:`step`, at this step's input where they depend on it.
-        control: what :func:`adapted` gave, where that is known already.
+        control: the result of :func:`adapted`, if already known.
 
     Returns:
-        as :func:`respond`.
+        as for :func:`respond`.
     """
     dtype, policy = state.x_hat.dtype, u_rl
     observation, u_rl, change, jacobian = map(wide, (observation, u_rl, change, jacobian))
@@ -295,7 +294,7 @@ def _memory(config: L1Config, state: L1State) -> _Memory:
     expected, varies = state.residual_covariance, config.covariance != "residuals"
     if covariance is None or noise is None or jacobian is None or varies == (expected is None):
         raise ValueError(
-            "the state is that of a controller with other settings: make it with "
+            "the state belongs to a controller with other settings: make it with "
             "init(batch_size, observation_dim, action_dim, config)"
         )
     return _Memory(covariance, noise, jacobian)
@@ -304,7 +303,7 @@ def _memory(config: L1Config, state: L1State) -> _Memory:
 def _expected_covariance(
     config: L1Config, state: L1State, residuals: ResidualStatistics, fresh: Tensor
 ) -> Tensor:
-    """Of the residual just seen ``(n, n)`` or ``(..., n, n)``."""
+    """Covariance of the residual just seen ``(n, n)`` or ``(..., n, n)``."""
     covariance = wide(residuals.covariance)
     if state.residual_covariance is not None:
         n = state.x_hat.shape[-1]

@@ -24,7 +24,7 @@ from torchrl_l1.control.signals import (
 from torchrl_l1.control.state import L1Diagnostics, L1State, ResidualStatistics
 
 _ABSURD = 1e6
-"""A matched estimate of so many times half the range of the actions is none."""
+"""A matched estimate this many times half the range of the actions counts as none."""
 
 
 def filtered(config: L1Config, q: Tensor, sigma_m: Tensor) -> Tensor:
@@ -79,31 +79,32 @@ def step(
         u &= \mathrm{clip}(u_{RL} - q) \\
         \hat x &\leftarrow \hat x + d_t + J u + T (\hat\sigma + A_s \tilde x)
 
-    An episode begins with :math:`\hat x = x` and :math:`q = \sigma_m = 0`. The filter takes the
-    matched part of the step before, with ``filter_input="current"`` that of this one.
-    The estimate :math:`\hat\sigma` is in state units per second and the matched part
-    :math:`\sigma_m` in action units. What the least squares leaves over is unmatched: it enters
-    the prediction and no action cancels it. The predictor sees the saturated input. Before the
-    filter takes :math:`\sigma_m` in, it is projected, see :func:`project`.
+    An episode begins with :math:`\hat x = x` and :math:`q = \sigma_m = 0`. The filter takes in the
+    matched part of the previous step or, with ``filter_input="current"``, of this one. The estimate
+    :math:`\hat\sigma` is in state units per second and the matched part :math:`\sigma_m` in action
+    units. The residual of the least squares is unmatched: it enters the prediction, and no action
+    cancels it. The predictor sees the saturated input. Before the filter takes :math:`\sigma_m` in,
+    it is projected, see :func:`project`.
 
-    Pure, batched over leading dimensions and free of data-dependent branches. Where any input
-    of an environment is not finite, or the prediction error beyond :attr:`L1Config.max_error`, the
-    output is ``u_rl``, ``non_finite`` is set and that environment restarts at its next step; the
-    others are not touched. A column of the Jacobian without a visible effect takes no part in the
-    least squares, see :func:`~torchrl_l1.control.least_squares.without_effect`. Half precision is
-    computed with in single precision.
+    The function is pure, batched over leading dimensions and free of data-dependent branches. If
+    any input of an environment is not finite, or its prediction error exceeds
+    :attr:`L1Config.max_error`, the output is ``u_rl``, ``non_finite`` is set and that environment
+    restarts at its next step; the others are unaffected. A column of the Jacobian without a visible
+    effect takes no part in the least squares, see
+    :func:`~torchrl_l1.control.least_squares.without_effect`. Half-precision inputs are computed in
+    single precision.
 
-    With ``filter="kalman"`` the step is that of :func:`~.kalman_law.estimate` and
+    With ``filter="kalman"`` the step consists of :func:`~.kalman_law.estimate` and
     :func:`~.kalman_law.follow` instead.
 
     Args:
         config: the settings; switching fields other than the filter's are not used here.
         state: from :func:`init` or the previous step.
         observation: ``(..., n)``, raw units.
-        u_rl: the policy's action ``(..., m)``; clipped to the bounds first.
+        u_rl: the policy's action ``(..., m)``; it is clipped to the bounds first.
         drift: ``(..., n)``, state units per step.
         jacobian: ``(..., n, m)``, state units per step and action unit.
-        restart: ``(..., 1)`` bool, where predictor and filter start afresh before this step.
+        restart: ``(..., 1)`` bool, true where predictor and filter restart before this step.
         residuals: what is known of the residuals; white ones of unit variance if ``None``.
 
     Returns:
@@ -111,7 +112,7 @@ def step(
         switching law, which this function does not evaluate, hold ``restart`` and zeros).
 
     Raises:
-        ValueError: if a setting or a shape does not fit the state's.
+        ValueError: if a setting or a shape does not match the state's.
 
     Examples:
         >>> from torchrl_l1.control import init
@@ -152,23 +153,23 @@ def respond(
     control: ControlInput | None = None,
     believed: Tensor | None = None,
 ) -> tuple[Tensor, L1State, Terms]:
-    """:func:`step` without its diagnostics, on ``x' = x + change + jacobian (u - u_bar)``.
+    """:func:`step` without diagnostics, on ``x' = x + change + jacobian (u - u_bar)``.
 
     Args:
         config: the settings.
         state: as in :func:`step`.
         observation: as in :func:`step`.
         u_rl: the policy's action within its bounds ``(..., m)``.
-        change: of the model at ``u_bar`` ``(..., n)``, state units per step.
+        change: predicted change at ``u_bar`` ``(..., n)``, state units per step.
         jacobian: as in :func:`step`.
         u_bar: operating point ``(..., m)``; zero if ``None``.
         restart: as in :func:`step`.
         residuals: as in :func:`step`.
-        control: the input, where it does not depend on this step's estimate and is known already.
+        control: the input, if it is already known since it does not depend on this step's estimate.
         believed: ``(..., 1)`` bool, false where the model is not finite at another input.
 
     Returns:
-        the executed input, the next state (but for what a switch changes) and what
+        the executed input, the next state (except for what a switch changes) and what
         :func:`diagnose` needs.
     """
     _check_shapes(state, observation, u_rl, change, "change", jacobian, restart)
@@ -178,8 +179,8 @@ def respond(
     fresh = ~state.started if restart is None else ~state.started | restart
     x_hat = torch.where(fresh, observation, state.x_hat)
 
-    # State prediction error, estimate and its matched part. Everything is in state units per
-    # step here: this is T sigma_hat, so that no division by a small T enters the state.
+    # State prediction error, estimate and its matched part. Everything here is in state units per
+    # step: the estimate is T sigma_hat, so that no division by a small T enters the state.
     x_err = x_hat - observation
     estimate = x_err * -like(x_err, config.adaptation_gain)
     reach = like(x_err, config.half_range)
@@ -191,7 +192,7 @@ def respond(
         residual = white.squeeze(-1)
     matched, ill_conditioned = solve_matched(columns, residual, invisible)
     if config.matched_bound is not None:
-        # What a million times the actions' range would explain is not matched.
+        # An effect that would take a million times the actions' range is not matched.
         absurd = any_of(matched.abs() > _ABSURD * reach)
         matched = matched.masked_fill(absurd, 0.0)
         ill_conditioned = ill_conditioned | absurd
@@ -210,7 +211,7 @@ def respond(
     finite = credible(config, dtype, x_err, observation, x_hat)
     finite = finite if believed is None else finite & believed
     non_finite = ~finite
-    # The least squares gives finite numbers whatever it gets, so q and sigma_m need no care.
+    # The least squares gives finite numbers for any input, so q and sigma_m need no check.
     following = L1State(
         x_hat=x_hat.masked_fill(non_finite, 0.0),
         u_bar=state.u_bar,
@@ -225,8 +226,8 @@ def respond(
 
 
 def _effects(jacobian: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
-    """What inputs ``(..., m)`` do to the state: ``(..., n)`` each."""
-    if jacobian.shape[-1] == 1:  # the same, without a product of matrices
+    """The effect of inputs ``(..., m)`` on the state: ``(..., n)`` each."""
+    if jacobian.shape[-1] == 1:  # the same, without a matrix product
         column = jacobian.squeeze(-1)
         return tuple(column * each for each in inputs)
     return (jacobian @ torch.stack(inputs, dim=-1)).unbind(-1)
@@ -249,7 +250,7 @@ def _check_shapes(
         ("jacobian", jacobian, (*n, m[-1])),
         ("restart", restart, state.started.shape),
     ):
-        # Broadcasting would hide some of these.
+        # Broadcasting would hide some of these errors.
         if value is not None and value.shape != expected:
             raise ValueError(
                 f"{name} has shape {tuple(value.shape)}, expected {tuple(expected)} as the state"

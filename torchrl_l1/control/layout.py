@@ -1,4 +1,4 @@
-"""The tensordict side of L1: specs of its state and signals, and what both faces share."""
+"""The tensordict side of L1: specs of its state and signals, and code that both forms share."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ L1_KEY = "l1"
 
 
 def entry_name(key: str, owner: str) -> str:
-    """The name of the nested tensordict, if it is one.
+    """The name of the nested tensordict, checked to be a single name.
 
     Raises:
         TypeError: if it is a key of several parts.
@@ -92,7 +92,7 @@ class Layout:
         )
 
     def bounded(self, config: L1Config) -> L1Config:
-        """The configuration with open action bounds filled from the action spec."""
+        """The configuration with open action bounds filled in from the action spec."""
         return with_open_bounds(config, self.low, self.high)
 
     def state_spec(self, config: L1Config) -> Composite:
@@ -121,7 +121,7 @@ class Layout:
         self, batch_size: torch.Size, config: L1Config, diagnostics: bool = True
     ) -> TensorDictBase:
         """Entries of a controller that has not started."""
-        # An environment that is not batch-locked decides on more dimensions at reset.
+        # An environment that is not batch-locked may add dimensions at reset.
         extra = batch_size[: len(batch_size) - len(self.batch_size)]
         return self.spec(config, diagnostics).zero(extra)
 
@@ -146,7 +146,7 @@ def pack(
     entries["u_exec"] = executed
     if diagnostics is not None:
         entries.update(diagnostics._asdict())
-    # Not TensorDict(...), whose checks of each entry are most of what this would take.
+    # Not TensorDict(...), whose checks of each entry would take most of the time.
     return TensorDict._new_unsafe(entries, batch_size=torch.Size(batch_size), device=device)
 
 
@@ -167,10 +167,10 @@ def _vector_spec(env: EnvBase, kind: str, key: NestedKey) -> TensorSpec:
 
 
 def action_bounds(action: TensorSpec) -> tuple[Scalars | None, Scalars | None]:
-    """Bounds of an action spec, ``None`` if it has none.
+    """Bounds of an action spec; ``None`` if it has none.
 
     Raises:
-        ValueError: if the environments of a batch have different ones.
+        ValueError: if the environments of a batch have different bounds.
     """
     if not isinstance(action, Bounded):
         return None, None
@@ -187,7 +187,7 @@ def action_bounds(action: TensorSpec) -> tuple[Scalars | None, Scalars | None]:
 
 
 def _scalars(bound: Tensor) -> Scalars:
-    # One number costs nothing per step; a tuple becomes a tensor each time.
+    # A number costs nothing per step; a tuple becomes a tensor each time.
     values = tuple(bound.tolist())
     return values[0] if values.count(values[0]) == len(values) else values
 
@@ -204,7 +204,7 @@ def as_action_jacobian(
     out_key: NestedKey | None = None,
     ensemble_dim: int | None = None,
 ) -> ActionJacobian:
-    """The dynamics as an :class:`ActionJacobian`, which is returned as it is."""
+    """The dynamics as an :class:`ActionJacobian`; one given is returned as it is."""
     if isinstance(dynamics, ActionJacobian):
         if out_key is not None or ensemble_dim is not None:
             raise ValueError("give out_key and ensemble_dim to the ActionJacobian")
@@ -225,14 +225,14 @@ def as_action_jacobian(
 
 
 class Advanced(NamedTuple):
-    """What :func:`advance` read and found.
+    """The result of :func:`advance`.
 
     Attributes:
-        u_rl: the policy's action, in its type.
-        executed: the executed input, in that type.
-        following: nested tensordict of what follows.
-        state: that is in it.
-        seal: that was read, if any.
+        u_rl: the policy's action, in its own type.
+        executed: the executed input, in the same type.
+        following: nested tensordict of the next state and signals.
+        state: the state in it.
+        seal: the seal that was read, if any.
     """
 
     u_rl: Tensor
@@ -256,27 +256,27 @@ def advance(
     emitted: Emitted | None = None,
     seal_is_required: bool = True,
 ) -> Advanced:
-    """Read a step's inputs, the state's entries of those names among them, and take the step.
+    """Read a step's inputs and the named state entries, and take the step.
 
     Args:
         step: the controller's step.
-        names: of the state's entries.
-        tensordict: to read.
+        names: names of the state's entries.
+        tensordict: the tensordict to read.
         observation_key: key of the observation.
         action_key: key of the action.
-        key: of the nested tensordict with the state.
-        owner: name of the class that reads, for errors.
-        remedy: what to do where there is no state.
+        key: key of the nested tensordict with the state.
+        owner: name of the reading class, for errors.
+        remedy: what to do if there is no state.
         check: whether observation and state must be those that were sealed.
         emitted: what was sealed last.
-        seal_is_required: whether there must be a seal.
+        seal_is_required: whether a seal must be present.
 
     Returns:
-        what was read and what follows.
+        what was read, and the next state and signals.
 
     Raises:
         KeyError: if an entry is missing.
-        ValueError: if one has another shape, or is not what was sealed.
+        ValueError: if one has the wrong shape, or is not what was sealed.
     """
     observation = required_entry(tensordict, observation_key, owner)
     action = required_entry(tensordict, action_key, owner)
@@ -286,16 +286,14 @@ def advance(
             f"{owner} found no state under {key!r}: {remedy}, and let no transform rename or "
             "remove it"
         )
-    found = dict(nested.items())  # a look-up of each would cost as much as a small kernel
+    found = dict(nested.items())  # looking each one up would cost as much as a small kernel
     entries: dict[str, Any] = {name: found.get(name) for name in names}
     seal = found.get(SEAL) if check else None
     missing = [name for name, value in entries.items() if value is None]
     if check and seal_is_required and seal is None:
         missing.append(SEAL)
     if missing:
-        lost = (
-            "a transform, a module or a collector took it away on the way; keep all that is there"
-        )
+        lost = "a transform, a module or a collector removed it on the way; keep everything there"
         raise KeyError(f"{owner} found no {missing} under {key!r}: {lost}")
     state = L1State(**entries)
     for name, value, like in (
@@ -331,19 +329,19 @@ def advance(
 
 
 def required_entry(tensordict: TensorDictBase, key: NestedKey, owner: str) -> Tensor:
-    """The entry, or a ``KeyError`` that says what there is instead."""
+    """The entry, or a ``KeyError`` that lists the entries there are instead."""
     value = tensordict.get(key, None)
     if value is None:
         found = sorted(map(str, tensordict.keys(include_nested=isinstance(key, tuple))))
         raise KeyError(
-            f"{owner} found no {key!r} in the tensordict, only {found}: where a transform has "
-            "renamed or removed it, keep it there or give the key that it has"
+            f"{owner} found no {key!r} in the tensordict, only {found}: if a transform has "
+            "renamed or removed it, keep it there or give its new key"
         )
     return value
 
 
 def declared_dimension(model: ActionJacobian, name: str, given: int | None) -> int | None:
-    """The width given, or else the one that the model declares."""
+    """The width given, or else the one the model declares."""
     declared = getattr(model.dynamics, name, None)
     declared = declared if isinstance(declared, int) else None
     if given is not None and declared is not None and given != declared:

@@ -8,9 +8,9 @@ from torch import Tensor
 RANK_TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
 """Smallest squared pivot of the scaled normal equations that counts as full rank, by dtype.
 
-A squared pivot is one minus the squared multiple correlation of a column with those before it,
-so columns within about 0.2 degrees (float32) or 0.0006 degrees (float64) of dependence, and no
-others, are flagged.
+A squared pivot is one minus the squared multiple correlation of a column with those before it.
+Columns are flagged if and only if they are within about 0.2 degrees (float32) or 0.0006 degrees
+(float64) of linear dependence.
 """
 
 DAMPING = 1e-3
@@ -21,44 +21,43 @@ remaining directions by about 0.1 percent.
 """
 
 EFFECT_TOLERANCE = {torch.float32: 1e-7, torch.float64: 1e-8}
-"""Smallest effect of an action that can be told from none, relative to the state, by dtype.
+"""Smallest effect of an action, relative to the state, that counts as one, by dtype.
 
-In single precision a smaller one vanishes in the rounding of the observation; no learned model is
-so exact that it could tell the effect from its own error.
+In single precision a smaller effect vanishes in the rounding of the observation; no learned model
+is accurate enough to distinguish it from its own error.
 """
 
 _SMALLEST_STATE = 1e-3
-"""A state counts as no smaller than this in :func:`without_effect`, raw units.
+"""Smallest magnitude at which :func:`without_effect` takes a state, raw units.
 
-At rest in the origin any effect is infinite in relation to it.
+Relative to a state at rest in the origin, any effect would be infinite.
 """
 
 _SMALLEST_RELATIVE_COLUMN = 1e-3
-"""Columns are scaled to unit length, but by no more than this times the longest column.
+"""Columns are scaled to unit length; those shorter than this times the longest, by that length.
 
-Undamped least squares does not depend on the scaling. Shorter columns lose pivot, so that an
-action without effect is flagged instead of being given an enormous estimate.
+Undamped least squares does not depend on the scaling. Shorter columns lose pivot, so an action
+without effect is flagged instead of getting an enormous estimate.
 """
 
 
 def solve_matched(
     jacobian: Tensor, residual: Tensor, ignored: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    r"""Least-squares solution of ``jacobian @ x = residual``, damped where that is ill posed.
+    r"""Least-squares solution of ``jacobian @ x = residual``, damped if ill posed.
 
-    Column-equilibrated normal equations by Cholesky decomposition: for tall, thin Jacobians
-    this is the cheapest batched solver, raises nothing and compiles. One action has a closed
-    form.
+    Column-equilibrated normal equations by Cholesky decomposition: for tall, thin Jacobians this is
+    the cheapest batched solver, never raises and compiles. One action has a closed form.
 
     Args:
         jacobian: ``(..., n, m)``.
         residual: ``(..., n)``.
-        ignored: columns that count as zero ``(..., m)``, bool; none if ``None``.
+        ignored: columns that are treated as zero ``(..., m)``, bool; none if ``None``.
 
     Returns:
         the solution ``(..., m)``, always finite, and flags ``(..., 1)``, true where a column is
         ignored or the Jacobian is rank deficient, ill conditioned (see :data:`RANK_TOLERANCE`) or
-        not finite. A Jacobian or residual that is not finite gives zeros.
+        not finite. A non-finite Jacobian or residual gives zeros.
 
     Examples:
         >>> jacobian = torch.tensor([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]])
@@ -73,7 +72,7 @@ def solve_matched(
     if jacobian.shape[-1] == 1:
         return _solve_one_column(jacobian, residual, ignored)
     if ignored is not None:
-        # A product keeps the strides of the Jacobian, on which rounding depends.
+        # A product keeps the strides of the Jacobian, which affect rounding.
         jacobian = jacobian * ~ignored.unsqueeze(-2)
     solution, ill_conditioned = _solve_columns(jacobian, residual)
     if ignored is not None:
@@ -82,7 +81,7 @@ def solve_matched(
 
 
 def without_effect(jacobian: Tensor, size: Tensor, reach: Tensor | float) -> Tensor:
-    r"""Which actions have no effect that could be seen, whatever they do: ``(..., m)``, bool.
+    r"""Actions without a visible effect, whatever their value: ``(..., m)``, bool.
 
     Those for which :math:`|J_{ij}|\, h_j < \tau \max(|x_i|, 10^{-3})` in every state :math:`i`,
     with :math:`h` half the range of the actions and :math:`\tau` of :data:`EFFECT_TOLERANCE`.
@@ -104,7 +103,7 @@ def without_effect(jacobian: Tensor, size: Tensor, reach: Tensor | float) -> Ten
 
 
 def any_of(flags: Tensor) -> Tensor:
-    """Whether any flag is set: ``(..., d)`` to ``(..., 1)``; of one it is that flag."""
+    """Whether any flag is set: ``(..., d)`` to ``(..., 1)``; a single one is returned as it is."""
     return flags if flags.shape[-1] == 1 else flags.any(-1, keepdim=True)
 
 
@@ -113,7 +112,7 @@ def _solve_one_column(
 ) -> tuple[Tensor, Tensor]:
     column = jacobian.squeeze(-1)
     square = column.square().sum(-1, keepdim=True)
-    # A comparison with what is not a number is false.
+    # Comparisons with NaN are false.
     usable = (square > torch.finfo(square.dtype).tiny) & (square < torch.inf)
     usable = usable if ignored is None else usable & ~ignored
     unusable = ~usable
@@ -131,13 +130,13 @@ def _solve_columns(jacobian: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
     products = columns.mT @ torch.cat([columns, residual.unsqueeze(-1)], -1)
     gram, projected = products[..., :-1], products[..., -1:]
     eye = torch.eye(gram.shape[-1], dtype=dtype, device=gram.device)
-    # Both systems in one call: choosing between them by a branch would not batch.
+    # Both systems in one call: a branch between them would not batch.
     factor, info = torch.linalg.cholesky_ex(torch.stack([gram, gram.add(eye, alpha=DAMPING)]))
     projected = projected.expand(2, *scale.shape, 1)
     plain, damped = torch.cholesky_solve(projected, factor).squeeze(-1).unbind(0)
     pivots = factor[0].diagonal(dim1=-2, dim2=-1).amin(-1, keepdim=True)
     tolerance = RANK_TOLERANCE.get(dtype, RANK_TOLERANCE[torch.float32])
-    # Written so that a pivot that is not a number, as of an infinite column, is flagged.
+    # Written so that a NaN pivot, as from an infinite column, is flagged.
     well_conditioned = (pivots > tolerance**0.5) & (info[0].unsqueeze(-1) == 0)
     return torch.where(well_conditioned, plain, damped) / scale, ~well_conditioned
 
@@ -148,23 +147,23 @@ def _smallest_length(dtype: torch.dtype) -> float:
 
 
 def is_finite(vector: Tensor) -> Tensor:
-    """Whether a vector's sum is finite: ``(..., d)`` to ``(..., 1)``, in half of the kernels."""
+    """Whether a vector's sum is finite: ``(..., d)`` to ``(..., 1)``, in half as many kernels."""
     total = vector.sum(-1, keepdim=True)
     return total - total == 0
 
 
 def whitened(covariance: Tensor, *columns: Tensor) -> tuple[Tensor, ...]:
-    r"""Columns in the coordinates in which a residual of that covariance is white.
+    r"""Columns in coordinates that whiten residuals of the given covariance.
 
-    With :math:`\Lambda = L L^\top` this is :math:`L^{-1} M`: least squares of the results is
-    generalised least squares of the columns.
+    With :math:`\Lambda = L L^\top` this is :math:`L^{-1} M`: least squares on the result is
+    generalised least squares on the columns.
 
     Args:
-        covariance: ``(..., n, n)``, positive definite; common to a batch or one for each row.
+        covariance: ``(..., n, n)``, positive definite; shared by a batch or one for each row.
         columns: matrices ``(..., n, k)``.
 
     Returns:
-        one matrix ``(..., n, k)`` for each. Where the covariance is not positive definite its
+        one matrix ``(..., n, k)`` for each. Where the covariance is not positive definite, its
         entries are not finite.
 
     Examples:
@@ -175,7 +174,7 @@ def whitened(covariance: Tensor, *columns: Tensor) -> tuple[Tensor, ...]:
     factor, info = torch.linalg.cholesky_ex(covariance)
     factor = factor.masked_fill((info != 0)[..., None, None], torch.nan)
     stacked = torch.cat(columns, -1)
-    if covariance.ndim == 2:  # once for all rows: a product is cheaper than their solutions
+    if covariance.ndim == 2:  # once for all rows: a product is cheaper than solving for each
         eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
         solved = torch.linalg.solve_triangular(factor, eye, upper=False) @ stacked
     else:

@@ -24,10 +24,10 @@ def read_module(
     out_key: NestedKey | None,
     predicts: Predicts | None,
 ) -> tuple[ChangeFunction, Predicts]:
-    """What a module predicts of observation and action, and whether it is the change.
+    """What a module predicts from observation and action, and whether that is the change.
 
     Raises:
-        ValueError: if the keys are not those of the module, or do not tell what it predicts.
+        ValueError: if the keys are not the module's, or do not determine what it predicts.
     """
     out_key = _prediction_key(module, observation_key, action_key, out_key)
     predict = _on_tensors(module, observation_key, action_key, out_key)
@@ -58,7 +58,7 @@ def _prediction_key(
 
 
 def _told_by(out_key: NestedKey, observation_key: NestedKey) -> Predicts:
-    """What a module predicts, by the key that it writes."""
+    """What a module predicts, according to the key that it writes."""
     path, observed = _path(out_key), _path(observation_key)
     if path in (observed, ("next", *observed)):
         return "next_observation"
@@ -68,7 +68,7 @@ def _told_by(out_key: NestedKey, observation_key: NestedKey) -> Predicts:
     if path[0] == "next" or words & _NEXT:
         return "next_observation"
     raise ValueError(
-        f"the dynamics module writes {out_key!r}, which does not tell what it predicts: give "
+        f"the dynamics module writes {out_key!r}, which does not show what it predicts: give "
         "predicts='change' or predicts='next_observation'"
     )
 

@@ -1,4 +1,4 @@
-"""The bound on what cancelling can do: a controller that is told the disturbance."""
+"""The upper bound on what cancelling can achieve: a controller that knows the disturbance."""
 
 from __future__ import annotations
 
@@ -27,31 +27,30 @@ from torchrl_l1.control.transform import L1Transform
 
 
 class OracleTransform(Transform):
-    r"""A clairvoyant in the place of :class:`~torchrl_l1.control.L1Transform`.
+    r"""A clairvoyant controller that takes the place of :class:`~torchrl_l1.control.L1Transform`.
 
-    It looks up the matched disturbances that stand before it in ``Compose``, or in a transformed
-    environment inside, and sends what they turn back into the policy's action: the policy's action
-    less the matched disturbance, clipped once, at the end, to what the actuators can do. With
-    disturbances
-    :math:`d_1, \dots, d_k` in the order of ``Compose``, an input :math:`u` reaches the plant as
-    :math:`d_1(\dots d_k(u))`, and the oracle sends
+    It looks up the matched disturbances before it in ``Compose``, or in a transformed environment
+    inside, and sends the input that they turn back into the policy's action: the policy's action
+    minus the matched disturbance, clipped once, at the end, to the actuators' limits. With
+    disturbances :math:`d_1, \dots, d_k` in the order of ``Compose``, an input :math:`u` reaches the
+    plant as :math:`d_1(\dots d_k(u))`, and the oracle sends
 
     .. math:: u = \mathrm{clip}\big(d_k^{-1}(\dots d_1^{-1}(\pi(x)))\big).
 
     No estimator can do better than this with the same policy: wherever the bounds allow it, the
-    plant receives exactly what the policy asked for, from the first step on. It knows nothing of
-    noise, of disturbances that the input does not reach, nor of how good the policy is: one that
-    gains from a disturbance loses with the oracle.
+    plant receives exactly what the policy asked for, from the first step on. The oracle does not
+    account for noise, for disturbances that the input cannot reach, or for the quality of the
+    policy: a policy that gains from a disturbance does worse with the oracle.
 
-    A disturbance is matched for it if its transform has a method ``compensate(action)`` that
-    returns, without a side effect, the action which, sent through the transform at this step,
+    The oracle treats a disturbance as matched if its transform has a method ``compensate(action)``
+    without side effects. It must return the action which, sent through the transform at this step,
     makes the plant receive ``action``.
 
-    No gradient flows through the oracle, as none does through L1.
+    No gradient flows through the oracle, nor through L1.
 
-    ``action`` stays the policy's, and ``("next", key, "u_exec")`` holds the executed input, as
-    with ``L1Transform``, which this takes the place of: it must come after the disturbances, and
-    there must not be both.
+    As with ``L1Transform``, ``action`` stays the policy's, and ``("next", key, "u_exec")`` holds
+    the executed input. The oracle replaces ``L1Transform``: it must come after the disturbances,
+    and there must not be both.
 
     Args:
         action_key: key of the action.
@@ -59,8 +58,8 @@ class OracleTransform(Transform):
 
     Raises:
         ValueError: at a reset, if a transform that maps actions to other units stands between a
-            disturbance and the oracle, if there is another controller, or if disturbances are
-            within the members of a ``SerialEnv``; those of other processes are not asked.
+            disturbance and the oracle, if there is another controller, or if there are disturbances
+            within the members of a ``SerialEnv``; environments in other processes are not checked.
         KeyError: at a step, if there is no action.
         RuntimeError: if used in a replay buffer.
 
@@ -91,7 +90,7 @@ class OracleTransform(Transform):
         return observation_spec
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Refused: the oracle acts at the steps of an environment, not on stored data.
+        """Rejected: the oracle acts at the steps of an environment, not on stored data.
 
         Raises:
             RuntimeError: always.
@@ -151,10 +150,10 @@ class OracleTransform(Transform):
         )
 
     def _compensations(self) -> Iterator[Callable[[Tensor], Tensor]]:
-        """Those of the disturbances before this one, in the order in which they are undone.
+        """The disturbances before this transform, in the order in which they are undone.
 
-        An action meets the last transform first and the plant last: what the plant is to receive
-        is traced back from the first transform, of the innermost environment.
+        An action meets the last transform first and the plant last, so the plant's input is traced
+        back from the first transform, that of the innermost environment.
         """
         undone, before = "", self._before()
         keys = action_keys(before, self.action_key)
@@ -171,7 +170,7 @@ class OracleTransform(Transform):
                 )
 
     def _before(self) -> list[nn.Module]:
-        """The transforms before this one, of the innermost environment first."""
+        """The transforms before this one, innermost environment first."""
         return list(takewhile(lambda one: one is not self, transforms_of(self._environment())))
 
     def _check_surroundings(self) -> None:
@@ -182,7 +181,7 @@ class OracleTransform(Transform):
             if is_other and _has_key(transform, "action_key", self.action_key):
                 raise ValueError(
                     f"{type(transform).__name__} is there beside OracleTransform, and both would "
-                    "act against one disturbance: leave one of them out"
+                    "act against the same disturbance: leave one of them out"
                 )
         while isinstance(environment, TransformedEnv):
             environment = environment.base_env
@@ -203,7 +202,7 @@ class OracleTransform(Transform):
 
 
 CONTROLLERS = (L1Primer, L1Transform, OracleTransform)
-"""Transforms that act against disturbances, of which two would be in each other's way."""
+"""Transforms that act against disturbances, of which any two would interfere."""
 
 
 def _has_key(transform: nn.Module, name: str, key: NestedKey) -> bool:

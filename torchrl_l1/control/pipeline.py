@@ -1,4 +1,4 @@
-"""What L1 asks of the pipeline around it: the order of transforms, and settings that are open."""
+"""What L1 requires of the pipeline around it: the order of transforms, and settings left open."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ from torchrl_l1.control.step_time import time_step
 
 _TOLERANCE = 1e-4
 
-# Actions of a policy that does not keep to the bounds may be a little beyond them; where an
-# action is scaled, other units are likelier.
+# Actions of a policy that ignores the bounds may lie a little beyond them; where an action is
+# scaled, other units are likelier.
 _FAR, _FAR_WHERE_SCALED = 1.5, 1.05
 
-# In place of a time step that is not known yet: so short that no setting is too fast for it.
+# Stands for a time step not known yet: so short that no setting is too fast for it.
 _SHORT = 1e-6
 
 
 def chain_of(transform: Transform) -> list[Transform]:
-    """All transforms beside this one, in order, those of nested ``Compose`` included."""
+    """All transforms beside this one, in order, including those of nested ``Compose``."""
     top = transform
     while True:
         reference = top.__dict__.get("_container")
@@ -79,7 +79,7 @@ def action_keys(transforms: Sequence[nn.Module], key: NestedKey) -> list[NestedK
         key: under which the last one receives it.
 
     Returns:
-        the key behind the first one, then those under which each receives it.
+        the key after the first one, then the keys under which each receives it.
     """
     keys = [key := unravel_key(key)]
     for transform in reversed(transforms):
@@ -91,15 +91,15 @@ def action_keys(transforms: Sequence[nn.Module], key: NestedKey) -> list[NestedK
 
 
 def check_resets(owner: str, env: EnvBase) -> None:
-    """Refuse an environment whose resets L1, with its state at the root, would not be told.
+    """Reject an environment that would not signal its resets to L1, with its state at the root.
 
     Raises:
-        ValueError: naming the masks that there are.
+        ValueError: naming the reset masks there are.
     """
     if "_reset" not in env.reset_keys:
         raise ValueError(
-            f"{owner} starts afresh where a root '_reset' says so, but this environment resets by "
-            f"{env.reset_keys} only: give it a 'done' at its root, for each of its batch"
+            f"{owner} restarts on a root '_reset', but this environment resets by "
+            f"{env.reset_keys} only: give it a 'done' at its root with the shape of its batch"
         )
 
 
@@ -110,9 +110,9 @@ def check_order(
     key: str,
     names: Sequence[str],
 ) -> None:
-    """Refuse transforms after L1 that must stand before it, or that take its state away.
+    """Reject transforms after L1 that must come before it, or that remove its state.
 
-    A transform that disturbs what actuators or sensors do says so with an attribute ``disturbs``,
+    A transform that disturbs actuators or sensors declares so with an attribute ``disturbs``,
     ``"action"`` or ``"observation"``, or has a method ``compensate``.
 
     Raises:
@@ -123,8 +123,8 @@ def check_order(
     position = next(index for index, member in enumerate(chain) if member is l1)
     if any(isinstance(member, ConditionalPolicySwitch) for member in chain):
         raise ValueError(
-            f"ConditionalPolicySwitch beside {owner} lets its policy take steps past it: make the "
-            "choice within the policy"
+            f"ConditionalPolicySwitch beside {owner} lets its policy bypass it: make the choice "
+            "within the policy"
         )
     for index, later in enumerate(chain[position + 1 :], position + 1):
         name = type(later).__name__
@@ -140,7 +140,7 @@ def check_order(
         acts_on, *_ = action_keys(chain[position + 1 : index], getattr(later, "key", action_key))
         if disturbs == "action" and acts_on == action_key:
             raise ValueError(
-                f"{name} comes after {owner}, so that it disturbs the policy's action and not what "
+                f"{name} comes after {owner} and so disturbs the policy's action, not what "
                 f"{owner} sends to the actuators: {order}"
             )
         overwrites = observation_key in _written(later) or (
@@ -155,20 +155,20 @@ def check_order(
         lost = _excluded(later, key, names)
         if lost:
             raise ValueError(
-                f"{name} comes after {owner} and takes away {lost} under {key!r}, which the next "
+                f"{name} comes after {owner} and removes {lost} under {key!r}, which the next "
                 f"step needs: exclude them from the data instead, such as in the replay buffer"
             )
 
 
 def _written(transform: Transform) -> list[NestedKey]:
-    # A change of type or device is none of the observation, and what NextObservationDelta drops
-    # has been passed on.
+    # A change of type or device does not change the observation, and what NextObservationDelta
+    # drops has been passed on.
     if isinstance(transform, (DTypeCastTransform, DeviceCastTransform, NextObservationDelta)):
         return []
     try:
         return list(transform.out_keys)
     except (AttributeError, NotImplementedError):
-        return []  # of its own, such as "is_init", which wait for the environment
+        return []  # keys of its own, such as "is_init", which need the environment
 
 
 def _excluded(transform: Transform, key: str, names: Sequence[str]) -> list[str]:
@@ -179,7 +179,7 @@ def _excluded(transform: Transform, key: str, names: Sequence[str]) -> list[str]
 
 
 def widen_selection(l1: Transform, key: str, names: Sequence[str]) -> None:
-    """Let ``key`` in a later ``SelectTransform`` stand for all that is in it, leaf by leaf."""
+    """Let ``key`` in a later ``SelectTransform`` stand for all its entries, leaf by leaf."""
     chain = chain_of(l1)
     for later in chain[chain.index(l1) + 1 :]:
         if isinstance(later, SelectTransform) and key in later.selected_keys:
@@ -188,7 +188,7 @@ def widen_selection(l1: Transform, key: str, names: Sequence[str]) -> None:
 
 
 def unspecified(l1: Transform, key: str, names: Sequence[str]) -> list[str]:
-    """Entries of the state that the environment's specs lack, so that it does not carry them on."""
+    """Entries of the state that the environment's specs lack, so it does not carry them along."""
     specified = l1.container.full_observation_spec.keys(True, True)
     return [name for name in names if (key, name) not in specified]
 
@@ -200,9 +200,9 @@ def carry(
     tensordict: TensorDictBase,
     following: TensorDictBase,
 ) -> None:
-    """Carry entries that the specs lack from the end of a step to the start of the next.
+    """Carry entries missing from the specs from the end of a step to the start of the next.
 
-    ``SelectTransform`` keeps them, since a step reads them, but takes them from the specs.
+    ``SelectTransform`` keeps them, since a step reads them, but removes them from the specs.
 
     Raises:
         KeyError: naming them, if they are gone.
@@ -212,22 +212,22 @@ def carry(
         if value is None:
             raise KeyError(
                 f"{owner} found no {lacking} under {('next', key)} after the step: a later "
-                f"transform takes them away; keep {key!r} and all that is in it"
+                f"transform removes them; keep {key!r} and everything in it"
             )
         following.set((key, name), value)
 
 
 class Settings:
-    """What a face of L1 was told, of which an environment may add the time step.
+    """Settings given to a form of L1, to which an environment may add the time step.
 
     Args:
-        owner: name of the face.
+        owner: name of the class.
         config: the settings, or ``None``.
         dt: time of one environment step in seconds; the environment's if ``None``.
-        others: further fields of :class:`L1Config`'s.
+        others: further fields of :class:`L1Config`.
 
     Raises:
-        TypeError: for fields that it lacks, or a config of another type.
+        TypeError: for unknown fields, or a config of another type.
         ValueError: if both config and fields are given, or a setting does not fit.
     """
 
@@ -250,34 +250,34 @@ class Settings:
             raise TypeError(f"{owner} got unknown settings {unknown}; L1Config has {sorted(known)}")
         self._others = dict(others)
         self.is_complete = config is not None or dt is not None
-        # Without a time step all but what depends on it is checked now.
+        # Without a time step, everything that does not depend on it is checked now.
         self.config = config or L1Config(_SHORT if dt is None else dt, **others)
 
     def complete(self, env: EnvBase) -> L1Config:
-        """The configuration, with the environment's time step where none was given.
+        """The configuration, with the environment's time step if none was given.
 
         Raises:
-            ValueError: if the environment does not tell.
+            ValueError: if the environment does not declare it.
         """
         if not self.is_complete:
             dt = time_step(env)
             if dt is None:
                 raise ValueError(
                     f"{self.owner} needs dt, the time of one environment step in seconds: the "
-                    "environment does not tell it"
+                    "environment does not declare it"
                 )
             self.config = L1Config(dt, **self._others)
             self.is_complete = True
         return self.config
 
     def bound(self, low: Scalars | None, high: Scalars | None) -> None:
-        """Fill action bounds that are open."""
+        """Fill in open action bounds."""
         config = self.config = with_open_bounds(self.config, low, high)
         self._others |= {"action_low": config.action_low, "action_high": config.action_high}
 
 
 def leaf_spec(spec: TensorSpec) -> TensorSpec:
-    """The spec itself, or the only leaf of a composite one.
+    """The spec itself, or the single leaf of a composite one.
 
     Raises:
         ValueError: if it has several.
@@ -297,42 +297,42 @@ def warn_of_surroundings(
     bounds: tuple[Scalars | None, Scalars | None],
     spec: tuple[Scalars | None, Scalars | None],
 ) -> None:
-    """Say what L1 can work with and hardly anybody wants.
+    """Warn about setups that L1 can work with but hardly anybody wants.
 
     Args:
-        owner: name of the face.
-        env: up to where L1 is.
+        owner: name of the class.
+        env: the environment up to L1.
         observation_key: of the observation.
-        bounds: lower and upper ones of the action in the settings.
+        bounds: lower and upper action bound in the settings.
         spec: those of the action's spec.
 
     Warns:
-        UserWarning: of bounds beyond the spec's, and of a normaliser whose statistics change.
+        UserWarning: about bounds beyond the spec's, and about a normaliser whose statistics change.
     """
     for name, sign, given, told in zip(
         ("action_low", "action_high"), (-1, 1), bounds, spec, strict=True
     ):
         if _is_beyond(given, told, sign):
             warnings.warn(
-                f"{owner} has {name}={given}, but the environment's action ends at {told}: what L1 "
-                "sends beyond that does not arrive, and L1 does not know; leave the bounds out, or "
-                "give infinite ones if the spec is wrong",
+                f"{owner} has {name}={given}, but the environment's action ends at {told}: "
+                "anything L1 sends beyond that is cut off without its knowledge; leave the "
+                "bounds out, or give infinite ones if the spec is wrong",
                 UserWarning,
                 stacklevel=3,
             )
     normaliser = _running_normaliser(env, observation_key)
     if normaliser is not None:
         warnings.warn(
-            f"{normaliser} stands between the plant and {owner} and changes its statistics as it "
-            f"goes, and with them what {observation_key!r} means to the model: freeze it, or put "
-            "it behind L1 with separate out_keys",
+            f"{normaliser} stands between the plant and {owner} and keeps changing its statistics, "
+            f"and with them what {observation_key!r} means to the model: freeze it, or put it "
+            "behind L1 with separate out_keys",
             UserWarning,
             stacklevel=3,
         )
 
 
 def scales_actions(env: EnvBase) -> bool:
-    """Whether an ``ActionScaling`` gives the action of an environment other units."""
+    """Whether an ``ActionScaling`` gives the environment's action other units."""
     found = [one for one in transforms_of(env) if isinstance(one, ActionScaling)]
     return any(bool((one.scale != 1).any() or (one.loc != 0).any()) for one in found)
 
@@ -340,10 +340,10 @@ def scales_actions(env: EnvBase) -> bool:
 def warn_of_action_units(
     dynamics: object, low: Scalars | None, high: Scalars | None, scaled: bool = False
 ) -> None:
-    """Say so where a model has been fitted to actions far beyond the bounds of L1.
+    """Warn if a model has been fitted to actions far beyond the bounds of L1.
 
-    The data's mean and deviation tell: from the middle of the bounds their root mean square is at
-    most half the range, whatever the actions within are.
+    The data's mean and deviation show it: whatever the actions within the bounds, their root mean
+    square around the middle is at most half the range.
 
     Args:
         dynamics: the model.
@@ -385,7 +385,7 @@ def _is_beyond(given: Scalars | None, told: Scalars | None, sign: int) -> bool:
 
 
 def _running_normaliser(env: EnvBase, observation_key: NestedKey) -> str | None:
-    """Name of what normalises the observation by statistics that it goes on to change."""
+    """Name of a normaliser of the observation whose statistics keep changing."""
     while isinstance(env, TransformedEnv):
         for transform in _flatten(env.transform):
             if (
@@ -400,7 +400,7 @@ def _running_normaliser(env: EnvBase, observation_key: NestedKey) -> str | None:
         return _running_normaliser(members[0], observation_key) if members else None
     wrapped = env.__dict__.get("_env", None)
     while wrapped is not None:
-        # Gymnasium's, of which there is one for vectors too.
+        # Gymnasium's, of which there is also one for vectors.
         if type(wrapped).__name__ == "NormalizeObservation":
             return "NormalizeObservation" if wrapped.update_running_mean else None
         wrapped = getattr(wrapped, "__dict__", {}).get("env", None)

@@ -1,4 +1,4 @@
-"""One look at a model before its first step: does it keep what L1 asks of a model?"""
+"""A check of a model before its first step: does it meet what L1 requires of it?"""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ ChangeFunction = Callable[[Tensor, Tensor], Tensor]
 JacobianFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 MOST_ROWS = 256
-"""Larger batches are probed on their first rows."""
+"""Of larger batches, only these first rows are checked."""
 
-_LARGEST = 1e6  # What is larger is not looked at: squares of it may overflow in an honest model.
+_LARGEST = 1e6  # Larger values are skipped: their squares may overflow in an honest model.
 
 _RANDOM = (nn.modules.dropout._DropoutNd, nn.RReLU)
 
@@ -44,7 +44,7 @@ class _ForkSafeLock:
 
 
 FORWARD_MODE = _ForkSafeLock()
-"""Held while torch differentiates in forward mode, whose levels all threads of a process share."""
+"""Held during forward-mode differentiation, whose levels all threads of a process share."""
 
 
 def probe(
@@ -54,28 +54,28 @@ def probe(
     observation: Tensor,
     action: Tensor,
 ) -> Mode:
-    """Look at a model on the data of a first step and choose how it is differentiated.
+    """Check a model on the data of a first step and choose how it is differentiated.
 
-    The first call is a plain one, which gives lazy layers their weights before torch's function
-    transforms meet them. No global random number is drawn. Data that are not finite, or beyond
-    1e6, are replaced by zeros.
+    The first call is a plain one, which gives lazy layers their weights before they meet torch's
+    function transforms. The global random state stays untouched. Data that are not finite, or
+    beyond 1e6, are replaced by zeros.
 
     Args:
         dynamics: the model, to be named in errors.
-        change: its predicted change ``(..., n)``; checks type and shape of its result.
-        jacobians: functions of value and Jacobian by mode, in the order of preference.
+        change: its predicted change ``(..., n)``; must check type and shape of its result.
+        jacobians: functions for value and Jacobian by mode, in order of preference.
         observation: ``(..., n)``.
         action: ``(..., m)``.
 
     Returns:
-        the first mode that works. A mode that is not the first one is worth a warning, and so is a
+        the first mode that works. A mode other than the first causes a warning, and so does a
         prediction that does not depend on the action.
 
     Raises:
-        TypeError: if the prediction is no tensor of the observation's type.
-        ValueError: if its shape is wrong, if it is not finite, if it changes from call to call, or
-            with the other rows of a batch, or has no derivative although it depends on the action;
-            if a layer is in train mode that must not be.
+        TypeError: if the prediction is not a tensor of the observation's type.
+        ValueError: if the prediction has the wrong shape, is not finite, changes from call to call
+            or with the other rows of the batch, or has no derivative although it depends on the
+            action; or if a layer is in train mode that must not be.
         RuntimeError: if no mode works.
     """
     refuse_training(dynamics)
@@ -104,18 +104,18 @@ def probe_covariance(
     is_whole: bool = True,
     is_late: bool = False,
 ) -> None:
-    """Look at the covariance of a model's residuals on the data of a first step.
+    """Check the covariance of a model's residuals on the data of a first step.
 
     Args:
         dynamics: the model, to be named in errors.
-        covariance_of: of observation and action: ``(n, n)``, or ``(..., n, n)``.
+        covariance_of: gives it for observation and action: ``(n, n)``, or ``(..., n, n)``.
         observation: ``(..., n)``.
         action: ``(..., m)``.
-        is_whole: whether residuals are whitened with it, and not only with its diagonal's mean.
-        is_late: whether it is asked for at the step after that of the residual.
+        is_whole: whether residuals are whitened with all of it, not just with its diagonal's mean.
+        is_late: whether it is evaluated at the step after that of the residual.
 
     Raises:
-        TypeError: if it is no tensor of the observation's type.
+        TypeError: if it is not a tensor of the observation's type.
         ValueError: if its shape is wrong, or it is not positive definite.
     """
     observation, action = _moderate(observation), _moderate(action)
@@ -132,8 +132,8 @@ def probe_covariance(
             )
         if not is_positive(found, is_whole):
             raise ValueError(
-                f"{name} is not finite and positive definite: give states that it never misses a "
-                "small variance"
+                f"{name} is not finite and positive definite: give states without errors a small "
+                "variance"
             )
         if is_late and found.ndim > 2:
             other = covariance_of(1.0 - 2.0 * observation, 1.0 - 2.0 * action)
@@ -146,7 +146,7 @@ def probe_covariance(
 
 
 def warn_of_residuals(dynamics: object, *, is_calibrated: bool) -> None:
-    """Say so where a model does not know its residuals, or how far they can be trusted.
+    """Warn if a model does not know its residuals, or how far to trust them.
 
     Args:
         dynamics: the model, to be named in warnings.
@@ -157,25 +157,25 @@ def warn_of_residuals(dynamics: object, *, is_calibrated: bool) -> None:
         measured = getattr(residuals, "measured", None)
         if isinstance(measured, Tensor) and not bool(measured):
             warnings.warn(
-                f"nothing has measured the residuals of {describe(dynamics)}, whose covariance is "
-                "taken for the identity: fit_ensemble does, and model.residuals.measure() takes "
-                "those of a training of your own",
+                f"the residuals of {describe(dynamics)} have not been measured, so their "
+                "covariance is taken to be the identity: fit the model with fit_ensemble, or "
+                "call model.residuals.measure() after your own training",
                 stacklevel=2,
             )
         return
     calibrated = getattr(residuals, "calibrated", None)
     if isinstance(calibrated, Tensor) and not bool(calibrated):
         warnings.warn(
-            f"the Kalman filter takes the residuals of {describe(dynamics)} for white noise, since "
-            "nothing has told it how far to trust them: after the fit, call calibrate_filter("
-            "model.residuals, model.value_and_jacobian, data, config) with episodes of at least 20 "
-            "steps, or give inflation",
+            f"the Kalman filter treats the residuals of {describe(dynamics)} as white noise, "
+            "since they are not calibrated: after the fit, call "
+            "calibrate_filter(model.residuals, model.value_and_jacobian, data, config) with "
+            "episodes of at least 20 steps, or give inflation",
             stacklevel=2,
         )
 
 
 def is_positive(covariance: Tensor, is_whole: bool = True) -> bool:
-    """Whether covariances ``(..., n, n)`` are positive definite, or else their diagonal's mean."""
+    """Whether covariances ``(..., n, n)`` are positive definite; if not whole, in the mean only."""
     covariance = covariance.to(torch.promote_types(covariance.dtype, torch.float32))
     if not is_whole:
         return bool((covariance.diagonal(dim1=-2, dim2=-1).mean(-1) > 0).all())
@@ -184,7 +184,7 @@ def is_positive(covariance: Tensor, is_whole: bool = True) -> bool:
 
 
 def _warn_of_units(dynamics: object, observation: Tensor) -> None:
-    """Say so where the first observations lie far from what a model says that it has seen."""
+    """Warn if the first observations lie far from the data that a model reports having seen."""
     box = getattr(dynamics, "box", None)
     low, high = getattr(box, "low", None), getattr(box, "high", None)
     if not (isinstance(low, Tensor) and isinstance(high, Tensor) and low.shape == high.shape):
@@ -194,7 +194,7 @@ def _warn_of_units(dynamics: object, observation: Tensor) -> None:
     width = high - low
     rows = observation.reshape(-1, observation.shape[-1])
     beyond = torch.maximum(rows - high, low - rows) > width
-    # Infinite before a fit, and without width where the data do not vary.
+    # Infinite before a fit, and zero in width where the data do not vary.
     far = (beyond & width.isfinite() & (width > 0)).float().mean(0) > 0.5
     if far.any():
         entries = far.nonzero().flatten().tolist()
@@ -207,14 +207,14 @@ def _warn_of_units(dynamics: object, observation: Tensor) -> None:
 
 
 def refuse_training(dynamics: object) -> None:
-    """Refuse layers that are random, or mix the rows of a batch, in train mode.
+    """Reject layers that are random, or mix the rows of a batch, in train mode.
 
     Raises:
-        ValueError: which names the first such layer and what to do about it.
+        ValueError: naming the first such layer and the remedy.
     """
     for root in _modules(dynamics):
         for name, layer in root.named_modules():
-            # What torch.jit.freeze made has no mode any more.
+            # After torch.jit.freeze a module has no mode any more.
             if getattr(layer, "training", False) and _needs_eval(layer):
                 raise ValueError(
                     f"{describe(dynamics)} is in train mode, in which its layer "
@@ -237,7 +237,7 @@ def _needs_eval(layer: nn.Module) -> bool:
 
 
 def _modules(dynamics: object) -> Iterator[nn.Module]:
-    """The modules that a model consists of, as far as they can be found."""
+    """The modules of which a model consists, as far as they can be found."""
     if isinstance(dynamics, nn.Module):
         yield dynamics
     elif isinstance(dynamics, functools.partial):
@@ -258,7 +258,7 @@ def _moderate(data: Tensor) -> Tensor:
 
 
 def _differ(a: Tensor, b: Tensor, observation: Tensor) -> bool:
-    """Whether two predictions of a change, from this observation, differ by more than rounding."""
+    """Whether two predicted changes, from this observation, differ by more than rounding."""
     size = max(float(x.abs().max()) if x.numel() else 0.0 for x in (a, observation))
     return not bool(((a - b).abs() <= 16 * torch.finfo(a.dtype).eps * size).all())
 
@@ -266,9 +266,9 @@ def _differ(a: Tensor, b: Tensor, observation: Tensor) -> bool:
 def _check_unwritten(
     dynamics: object, given: tuple[Tensor, Tensor], before: tuple[Tensor, Tensor]
 ) -> None:
-    """Refuse a model that works on its inputs in place: they are the environment's tensors."""
+    """Reject a model that modifies its inputs in place: they are the environment's tensors."""
     for name, one, other in zip(("observation", "action"), given, before, strict=True):
-        # What is written may be what was there; tensors of inference mode do not count writes.
+        # A write may leave the values unchanged; tensors in inference mode do not count writes.
         written = not one.is_inference() and one._version > 0
         if written or not torch.equal(one, other):
             raise ValueError(
@@ -282,11 +282,12 @@ def _check_repeatable(
 ) -> None:
     if not bool(value.isfinite().all()):
         raise ValueError(
-            f"{describe(dynamics)} predicts what is not finite at the first observation and action"
+            f"{describe(dynamics)} gives a prediction that is not finite at the first observation "
+            "and action"
         )
     if _differ(value, change(observation, action), observation):
         raise ValueError(
-            f"{describe(dynamics)} predicts something else at each call for the same observation "
+            f"{describe(dynamics)} gives another prediction at each call for the same observation "
             "and action: L1 needs the mean, without sampling or dropout (eval mode)"
         )
 
@@ -294,10 +295,10 @@ def _check_repeatable(
 def _check_rows(
     dynamics: object, change: ChangeFunction, observation: Tensor, action: Tensor, value: Tensor
 ) -> None:
-    """Change one row of the batch and see whether another one answers."""
+    """Change one row of the batch and see whether another row's prediction changes."""
     n = observation.shape[-1]
     if observation.shape[:-1].numel() == 1:
-        # Alone in its batch. Two of it must be predicted like one for there to be batches.
+        # Alone in its batch. There are batches only if two copies of a row are predicted like one.
         twice = [torch.stack([data.reshape(-1)] * 2) for data in (observation, action)]
         try:
             pair = change(*twice)
@@ -345,8 +346,8 @@ def _choose_mode(
     if any(_differ(value, change(observation, u), observation) for u in others):
         raise ValueError(
             f"{describe(dynamics)} predicts a change that depends on the action, but its "
-            "derivative by the action is zero: it is detached (detach, no_grad, NumPy) or "
-            "piecewise constant; keep the graph, or give the model a method "
+            "derivative with respect to the action is zero: it is detached (detach, no_grad, "
+            "NumPy) or piecewise constant; keep the graph, or give the model a method "
             "value_and_jacobian(observation, action)"
         )
     warnings.warn(
@@ -378,11 +379,11 @@ def _warn_of_reverse(
 
 
 def failure(dynamics: object, observation: Tensor, action: Tensor, error: Exception) -> ValueError:
-    """What to raise where a model cannot be called at all."""
+    """The error to raise if a model cannot be called at all."""
     return ValueError(
-        f"{describe(dynamics)} failed at its first call, with two arguments, an observation of "
-        f"shape {tuple(observation.shape)} and an action of shape {tuple(action.shape)}, both "
-        f"{observation.dtype}, which L1 expects a model to take: {_first_line(error)}"
+        f"{describe(dynamics)} failed at its first call; L1 calls a model with two arguments, an "
+        f"observation of shape {tuple(observation.shape)} and an action of shape "
+        f"{tuple(action.shape)}, both {observation.dtype}: {_first_line(error)}"
     )
 
 
@@ -402,7 +403,7 @@ def _first_line(error: Exception) -> str:
 
 
 def _culprit(dynamics: object, error: Exception) -> str:
-    """The innermost module that was at work when the error was raised."""
+    """The innermost module that was running when the error was raised."""
     names = {
         id(layer): _label(name, layer)
         for root in _modules(dynamics)

@@ -1,8 +1,8 @@
-"""Whether L1 reads what its environment gave: a seal on observation and controller's state.
+"""A seal on observation and controller's state: does L1 read what its environment gave?
 
-A step or reset writes the seal beside the state; the next step computes it anew of what it reads.
-It travels in the tensordict, so that batches, partial resets, processes, collectors and several
-rollouts at a time need no care.
+A step or reset writes the seal beside the state; the next step recomputes it from what it reads. It
+travels in the tensordict, so batches, partial resets, processes, collectors and several concurrent
+rollouts need no special treatment.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from torchrl_l1.control.state import COMMON, L1State
 SEAL = "seal"
 """Name of the entry beside those of the state, see :func:`seal_width`."""
 
-# Of entries of the same size: a change of type between float64 and float32 stays below it.
+# Relative to entries of the same size: a change between float64 and float32 stays below it.
 _TOLERANCE = 1e-6
 
-_LARGEST = 3.3e38  # in the range of float32, to which float64 may be changed
+_LARGEST = 3.3e38  # within the range of float32, which float64 values may be converted to
 
 
 def seal_width(observation_dim: int, action_dim: int, has_memory: bool) -> int:
@@ -31,33 +31,33 @@ def seal_width(observation_dim: int, action_dim: int, has_memory: bool) -> int:
 
 
 def sealed(observation: Tensor, state: L1State) -> Tensor:
-    """A copy of observation and state in the state's type, the caller may write to them in place.
+    """A copy of observation and state in the state's type, which the caller may modify in place.
 
-    Of what only some laws remember, which is wide, it is the sum.
+    Wide entries that only some laws remember are represented by their sum.
     """
-    # Every operation counts here: at a batch of one each costs as much as a thousand sums, and
-    # joining several types as much as three.
+    # Every operation counts here: at a batch size of one each costs as much as a thousand
+    # additions, and joining several types costs as much as three.
     x_hat, u_bar, q, sigma_m, n_switch, started, *_ = state
     dtype = x_hat.dtype
     flags = n_switch.to(dtype), started.to(dtype)
     parts = [observation.to(dtype), x_hat, u_bar, q, sigma_m, *flags]
     if memory := state.memory():
         parts.append(torch.cat(memory, -1).sum(-1, keepdim=True))
-    # What is not finite is a number of its own here: whoever looks at the entries finds none.
+    # Anything non-finite becomes a fixed number here; inspecting the entries will find it.
     largest = min(torch.finfo(dtype).max, _LARGEST)
     seal = torch.cat(parts, -1).nan_to_num(0.9 * largest, largest, -largest)
     return seal.detach() if seal.requires_grad else seal
 
 
 class Emitted(NamedTuple):
-    """What was sealed last, to tell a lost state from a changed observation.
+    """What was sealed last, to distinguish a lost state from a changed observation.
 
     Attributes:
         observation: the tensor itself, as given.
         state: its entries.
-        seal: of the two.
-        versions: of observation and entries then, which writing in place counts up; ``None`` for
-            tensors that do not count.
+        seal: the seal of the two.
+        versions: the version counters of observation and entries at that time, which in-place
+            writes increase; ``None`` for tensors without one.
     """
 
     observation: Tensor
@@ -71,7 +71,7 @@ class Emitted(NamedTuple):
         return cls(observation, state, seal, _versions(observation, state))
 
     def is_what_is_read(self, observation: Tensor, state: L1State, seal: Tensor) -> bool:
-        """Whether these are the very tensors that were emitted, unwritten since; no kernel."""
+        """Whether these are the very tensors emitted, not written to since; launches no kernel."""
         return (
             observation is self.observation
             and seal is self.seal
@@ -92,17 +92,17 @@ def verify(
     emitted: Emitted | None = None,
     zero_is_none: bool = False,
 ) -> Tensor:
-    """The observation, if it and the state are those of the seal; to within rounding.
+    """The observation, if it and the state match the seal up to rounding.
 
     Args:
         observation: ``(..., n)`` as read.
         state: as read.
         seal: as read, see :func:`seal_width`.
-        owner: name of the class that reads.
+        owner: name of the reading class.
         observation_key: where it reads the observation.
         key: where it reads state and seal.
         emitted: what it sealed last, if it remembers.
-        zero_is_none: whether a row of zeros is no seal.
+        zero_is_none: whether a row of zeros counts as no seal.
 
     Raises:
         ValueError: naming the observation's key or the state's entries.
@@ -115,8 +115,8 @@ def verify(
     found = sealed(observation, state)
     if found.shape != seal.shape:
         raise ValueError(
-            f"{owner}: the state under {key!r} is that of an L1 with other settings or widths, of "
-            "another controller's primer: each needs its own, under a key of its own"
+            f"{owner}: the state under {key!r} is that of an L1 with other settings or widths, "
+            "from another controller's primer: give each its own key"
         )
     if not torch.equal(found, seal):
         n = observation.shape[-1]
@@ -139,7 +139,7 @@ def _compare(
     differs = ~_close(found, seal)
     m, has_memory = divmod(found.shape[-1] - 2 * n - 2, 3)
     if has_memory:
-        # A sum is as exact as its terms, which may be larger than it.
+        # A sum is only as exact as its terms, which may be larger than it.
         terms = found if state is None else torch.cat(state.memory(), -1)
         scale = terms.abs().sum(-1).nan_to_num()
         differs[..., -1] &= (found - seal)[..., -1].abs() > 10 * _TOLERANCE * scale
@@ -149,7 +149,7 @@ def _compare(
         return
     changed = differs[..., :n].any(-1)
     if emitted is not None and emitted.seal.shape == found.shape and changed.any():
-        # With an observation that is right, it is the seal that is old, and the state with it.
+        # If the observation is right, the seal is old, and the state with it.
         same = _close(found[..., :n], emitted.seal[..., :n].to(found.dtype))
         changed = changed & ~same.all(-1)
     if changed.any():
@@ -187,7 +187,7 @@ def _of_state(owner: str, key: str, names: list[str]) -> str:
 
 
 def _lost(parts: list[bool], state: L1State | None, emitted: Emitted | None) -> list[str]:
-    """Names of what differs, in the parts of the seal or, where that is old itself, from before."""
+    """Names of what differs, by parts of the seal or, if that is old itself, from before."""
     names = list(L1State._fields) if state is None else list(state.entries())
     read: Sequence[Tensor | None] = () if state is None else state
     given: Sequence[Tensor | None] = () if emitted is None else emitted.state
@@ -204,11 +204,11 @@ def _lost(parts: list[bool], state: L1State | None, emitted: Emitted | None) -> 
 def _versions(observation: Tensor, state: L1State) -> tuple[int, ...] | None:
     try:
         return observation._version, *[value._version for value in state if value is not None]
-    except RuntimeError:  # tensors of inference mode do not count
+    except RuntimeError:  # tensors in inference mode do not count
         return None
 
 
-# Opaque to the compiler, which would break its graph at a question that depends on data.
+# Opaque to the compiler, whose graph would break at a data-dependent question.
 @torch.library.custom_op(
     "torchrl_l1::verified",
     mutates_args=(),

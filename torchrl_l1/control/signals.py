@@ -1,4 +1,4 @@
-"""What is done to the signals of every adaptive law: bounds, types, faults, diagnostics."""
+"""Processing of signals common to all adaptive laws: bounds, types, faults, diagnostics."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ def saturate(config: L1Config, action: Tensor) -> Tensor:
     """The action within the configured bounds."""
     low, high = config.action_low, config.action_high
     if isinstance(low, tuple) or isinstance(high, tuple):
-        # The configuration expands a number beside a tuple, so neither is a plain number here.
+        # The configuration expands a number given beside a tuple, so neither is a plain number
+        # here.
         low_bound = None if low is None else like(action, low)
         high_bound = None if high is None else like(action, high)
         return torch.clamp(action, low_bound, high_bound)  # type: ignore[arg-type]
@@ -34,9 +35,9 @@ def saturate(config: L1Config, action: Tensor) -> Tensor:
 def project(config: L1Config, sigma_m: Tensor) -> Tensor:
     r"""The matched estimate within :attr:`L1Config.matched_bound`.
 
-    This is the projection of adaptive control for a box. The authors' formulas have none, but
-    least squares with an almost vanishing :math:`J` turns any prediction error into an estimate
-    without bound, and the low-pass filter would take long to forget it.
+    This is the projection of adaptive control onto a box. The authors' formulas have none, but
+    least squares with an almost vanishing :math:`J` turns any prediction error into an unbounded
+    estimate, which the low-pass filter would take long to forget.
     """
     bound = config.matched_bound
     if bound is None:
@@ -49,14 +50,14 @@ def project(config: L1Config, sigma_m: Tensor) -> Tensor:
 
 
 def like(tensor: Tensor, value: Scalars) -> Tensor | float:
-    """A setting to compute with: numbers stay numbers, they need no device and cost no kernel."""
+    """A setting to compute with; a number stays a number, which needs no device and no kernel."""
     if isinstance(value, tuple):
         return torch.tensor(value, dtype=tensor.dtype, device=tensor.device)
     return value
 
 
 def _number(tensor: Tensor, bound: Scalars | None) -> float | None:
-    """A bound that the tensor's type can hold, which torch insists on."""
+    """A bound that the tensor's type can hold, as torch requires."""
     if bound is None or isinstance(bound, tuple) or math.isinf(bound):
         return cast(float | None, bound)
     largest = torch.finfo(tensor.dtype).max
@@ -64,9 +65,10 @@ def _number(tensor: Tensor, bound: Scalars | None) -> float | None:
 
 
 def wide(tensor: Tensor) -> Tensor:
-    """The tensor in a type that can be computed with: half precision in single precision.
+    """The tensor in a type that can be computed with: half precision becomes single precision.
 
-    Normal equations square the condition, and squares of half-precision numbers overflow at 256.
+    Normal equations square the condition number, and squares of half-precision numbers overflow at
+    256.
     """
     return tensor.float() if tensor.dtype in _HALF else tensor
 
@@ -79,7 +81,7 @@ def wide_state(state: L1State) -> L1State:
 
 
 def narrow(tensor: Tensor, dtype: torch.dtype) -> Tensor:
-    """The tensor in a type, with what that cannot hold as its largest number."""
+    """The tensor in another type, with values beyond its range set to its largest number."""
     if tensor.dtype == dtype or not tensor.is_floating_point():
         return tensor
     largest = torch.finfo(dtype).max
@@ -95,10 +97,10 @@ def narrow_entries(entries: Entries, dtype: torch.dtype) -> Entries:
 
 
 def credible(config: L1Config, dtype: torch.dtype, x_err: Tensor, *states: Tensor) -> Tensor:
-    """Whether a step's numbers can be reckoned with: ``(..., 1)``, bool.
+    """Whether a step's numbers can be computed with: ``(..., 1)``, bool.
 
-    None of them may be infinite or no number, the prediction error may not exceed
-    :attr:`L1Config.max_error`, and no state may be so large that its last digit does.
+    All of them must be finite, the prediction error must not exceed :attr:`L1Config.max_error`, and
+    no state may be so large that its last digit exceeds it.
 
     Args:
         config: the settings.
@@ -113,16 +115,16 @@ def credible(config: L1Config, dtype: torch.dtype, x_err: Tensor, *states: Tenso
     largest = torch.linalg.vector_norm(
         torch.cat([x_err, *(rounding * state for state in states)], -1), torch.inf, -1, True
     )
-    return largest <= limit  # a comparison with what is not a number is false
+    return largest <= limit  # comparisons with NaN are false
 
 
 class ControlInput(NamedTuple):
-    """What an adaptive law makes of the policy's action.
+    """What an adaptive law turns the policy's action into.
 
     Attributes:
-        q: what it takes away; the low-pass filter's next state ``(..., m)``.
+        q: what it subtracts; the low-pass filter's next state ``(..., m)``.
         unbounded: ``u_rl - q`` ``(..., m)``.
-        u: that within the bounds: the executed input ``(..., m)``.
+        u: the same within the bounds: the executed input ``(..., m)``.
     """
 
     q: Tensor
@@ -131,23 +133,23 @@ class ControlInput(NamedTuple):
 
     @classmethod
     def of(cls, config: L1Config, u_rl: Tensor, q: Tensor) -> ControlInput:
-        """The policy's action ``(..., m)`` less ``q``."""
+        """The policy's action ``(..., m)`` minus ``q``."""
         unbounded = u_rl - q
         return cls(q, unbounded, saturate(config, unbounded))
 
 
 class Terms(NamedTuple):
-    """What of a step :func:`diagnose` makes its signals of, in state units per step.
+    """The terms from which :func:`diagnose` makes its signals, in state units per step.
 
     Attributes:
         x_err: state prediction error ``(..., n)``.
         estimate: the uncertainty estimate ``(..., n)``.
-        effect_matched: its part that an action could cancel ``(..., n)``.
+        effect_matched: the part that an action could cancel ``(..., n)``.
         control: the input.
         ill_conditioned: see :func:`~torchrl_l1.control.solve_matched`.
-        non_finite: an input was not finite, or beyond belief ``(..., 1)``, bool.
+        non_finite: an input was not finite, or not believed ``(..., 1)``, bool.
         dtype: type of the state.
-        posterior: of the matched disturbance, with a Kalman filter.
+        posterior: posterior of the matched disturbance, with a Kalman filter.
     """
 
     x_err: Tensor
@@ -166,7 +168,7 @@ def diagnose(
     switch: Tensor | None = None,
     affinization_error: Tensor | None = None,
 ) -> L1Diagnostics:
-    """The diagnostics of a step, with those of the switching law if they are given."""
+    """The diagnostics of a step, with those of the switching law if given."""
     x_err, estimate, effect_matched, (q, unbounded, u) = terms[:4]
     ill_conditioned, non_finite, dtype, posterior = terms[4:]
     norms = torch.linalg.vector_norm(

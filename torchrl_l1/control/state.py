@@ -1,4 +1,4 @@
-"""What L1 remembers from step to step, what it reports, and what it is told of the residuals."""
+"""What L1 remembers from step to step, what it reports, and what it knows of the residuals."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class L1State(NamedTuple):
         sigma_m: matched uncertainty estimated at the last step ``(..., m)``, action units,
             projected if the configuration asks for it.
         n_switch: switches since the reset ``(..., 1)``, int64.
-        started: whether the other entries mean anything ``(..., 1)``, bool.
-        covariance: of the Kalman filter's estimate, which is ``sigma_m`` then,
-            ``(..., m * m)``; like the following ``None`` for the low-pass filter.
-        noise: running estimate of the squares of the residuals, relative to what their
-            covariance says ``(..., n)``.
-        jacobian: of the last step ``(..., n * m)``.
-        residual_covariance: expected at the last step ``(..., n * n)``; ``None`` if it is the
-            same everywhere.
+        started: whether the other entries are valid ``(..., 1)``, bool.
+        covariance: covariance of the Kalman filter's estimate, which ``sigma_m`` then holds,
+            ``(..., m * m)``; like the following entries ``None`` for the low-pass filter.
+        noise: running estimate of the squares of the residuals, relative to their covariance
+            ``(..., n)``.
+        jacobian: Jacobian of the last step ``(..., n * m)``.
+        residual_covariance: covariance expected at the last step ``(..., n * n)``; ``None`` if it
+            is the same everywhere.
     """
 
     x_hat: Tensor
@@ -43,20 +43,20 @@ class L1State(NamedTuple):
     residual_covariance: Tensor | None = None
 
     def entries(self) -> dict[str, Tensor]:
-        """Those that there are, by name."""
+        """The entries that are not ``None``, by name."""
         return {name: value for name, value in self._asdict().items() if value is not None}
 
     def memory(self) -> list[Tensor]:
-        """Those that only some laws have."""
+        """The entries that only some laws have."""
         return [value for value in self[COMMON:] if value is not None]
 
 
 COMMON = len(L1State._fields) - len(L1State._field_defaults)
-"""Number of entries that all laws have, which come first."""
+"""Number of entries that all laws have; they come first."""
 
 
 class ResidualStatistics(NamedTuple):
-    """What is known of the one-step residuals of a model without disturbances.
+    """What is known of a model's one-step residuals without disturbances.
 
     Attributes:
         covariance: ``(n, n)``, or one for each row ``(..., n, n)``; state units squared.
@@ -83,8 +83,8 @@ class L1Diagnostics(NamedTuple):
         saturation: fraction of the action's entries that a bound cut.
         ill_conditioned: the matched part came from damped least squares (bool).
         non_finite: an input was not finite: L1 stood aside and restarts (bool).
-        posterior_deviation: norm of the standard deviations of the Kalman filter's estimate,
-            action units; zero without it, like the next.
+        posterior_deviation: norm of the standard deviations of the Kalman filter's estimate, action
+            units; zero without that filter, like the next.
         significance: largest entry of its estimate in standard deviations.
     """
 
@@ -116,9 +116,9 @@ def init(
         batch_size: leading dimensions.
         observation_dim: n.
         action_dim: m.
-        config: the settings, which say what there is to remember; those of the paper if ``None``.
-        dtype: of the entries but ``n_switch`` and ``started``.
-        device: of all entries.
+        config: the settings, which decide what there is to remember; the paper's if ``None``.
+        dtype: type of all entries except ``n_switch`` and ``started``.
+        device: device of all entries.
 
     Examples:
         >>> init([5], observation_dim=4, action_dim=1).x_hat.shape
@@ -147,7 +147,7 @@ def init(
 
 
 def state_names(config: L1Config) -> tuple[str, ...]:
-    """What a controller with these settings remembers, by name.
+    """Names of what a controller with these settings remembers.
 
     Examples:
         >>> state_names(L1Config(0.05))

@@ -1,4 +1,4 @@
-"""How long a step of an environment takes, as far as it tells."""
+"""How long a step of an environment takes, as far as it declares that."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from typing import Any
 import gymnasium
 from torchrl.envs import EnvBase, FrameSkipTransform, PendulumEnv, SerialEnv, TransformedEnv
 
-# Wrappers of Gymnasium that repeat an action keep the number under one of these, by custom.
+# By convention, wrappers of Gymnasium that repeat an action keep the number under one of these.
 _REPEATS = ("_skip", "skip", "_frame_skip", "frame_skip", "action_repeat")
 
 _TOLERANCE = 1e-4
 
 
 def time_step(env: EnvBase | gymnasium.Env[Any, Any]) -> float | None:
-    """Time of one step of an environment in seconds; ``None`` where it does not tell.
+    """Time of one step of an environment in seconds; ``None`` if it does not declare it.
 
-    Read from: an attribute ``dt`` of the environment or of its ``task``, of the Gymnasium
-    environment inside, ``control_timestep`` of dm_control; times the frames that wrappers and
-    transforms skip. Environments in other processes are not asked. One of Gymnasium's may also be
-    given as it is.
+    Read from an attribute ``dt`` of the environment, of its ``task`` or of the Gymnasium
+    environment inside, or from ``control_timestep`` of dm_control, times the frames that wrappers
+    and transforms skip. Environments in other processes are not asked. A Gymnasium environment may
+    also be given directly.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -66,7 +66,7 @@ def _of_wrapped(env: Any) -> float | None:
 
 
 def repeats(wrapper: Any) -> int:
-    """How often a wrapper of Gymnasium repeats an action, by the attribute that is customary.
+    """How often a wrapper of Gymnasium repeats an action, by the conventional attribute.
 
     Examples:
         >>> from types import SimpleNamespace
@@ -94,7 +94,7 @@ def _number(value: Any) -> float | None:
 
 
 def check_time_step(owner: str, dt: float, env: EnvBase) -> None:
-    """Refuse a ``dt`` that is not the environment's, where that tells its own.
+    """Reject a ``dt`` that differs from the environment's, if that declares its own.
 
     Raises:
         ValueError: naming both.
@@ -103,5 +103,5 @@ def check_time_step(owner: str, dt: float, env: EnvBase) -> None:
     if told is not None and abs(dt - told) > _TOLERANCE * told:
         raise ValueError(
             f"{owner} has dt={dt:.6g}, but a step of the environment takes {told:.6g} s: leave dt "
-            "out or give that, or check_dt=False if the environment is wrong"
+            "out, give that value, or give check_dt=False if the environment is wrong"
         )

@@ -1,4 +1,4 @@
-"""The environment-side face of L1: a transform between the policy and the environment."""
+"""The environment-side form of L1: a transform between the policy and the environment."""
 
 from __future__ import annotations
 
@@ -44,12 +44,13 @@ from torchrl_l1.control.step_time import check_time_step
 
 @dataclass
 class _Last:
-    """What is remembered from one call to the next, of one process.
+    """What one process remembers from one call to the next.
 
-    Not the module's own attributes, of which setting one costs as much as a small kernel.
+    These are not the module's own attributes, since setting one of those costs as much as a small
+    kernel.
 
     Attributes:
-        ahead: what the step that is under way has found.
+        ahead: what the current step has found.
         emitted: what was sealed last.
         consumed: the seal from which the last step was taken.
         repeats: how often it was taken again.
@@ -64,59 +65,59 @@ class _Last:
 class L1Transform(Transform):
     """L1 adaptive control inside an environment (arXiv 2403.14860, Algorithm 2).
 
-    The policy's action stays in ``action``, so that replay data hold what the paper stores;
-    the environment receives the executed input. Under ``key`` the tensordict carries the
-    controller's state (:class:`~torchrl_l1.control.L1State`) from step to step, and
-    ``("next", key)`` also holds the executed input ``u_exec`` and the diagnostics
-    (:class:`~torchrl_l1.control.L1Diagnostics`). A reset starts the controller afresh in the
-    environments that it resets and in no others.
+    The policy's action stays in ``action``, so replay data hold what the paper stores; the
+    environment receives the executed input. Under ``key`` the tensordict carries the controller's
+    state (:class:`~torchrl_l1.control.L1State`) from step to step, and ``("next", key)`` also holds
+    the executed input ``u_exec`` and the diagnostics (:class:`~torchrl_l1.control.L1Diagnostics`).
+    A reset restarts the controller in the environments being reset and in no others.
 
-    Order matters, as the last transform of ``Compose`` meets the action first. Before this one
-    come transforms that disturb the executed input (noise, bias), that repeat it
-    (``FrameSkipTransform``) or that change the observation, to which the model must have been
-    fitted; after it those that map the policy's action to what L1 works in (``ActionScaling``).
-    L1 refuses an order that is wrong, and what it cannot see in the chain it notices at the next
-    step: the observation that it reads must be the one that it passed on, and its state that of
-    the last step. A change of type or device is none.
+    Order matters, as the last transform of ``Compose`` meets the action first. Transforms that
+    disturb the executed input (noise, bias), repeat it (``FrameSkipTransform``) or change the
+    observation, to which the model must have been fitted, come before this one. Those that map the
+    policy's action to the units of L1 (``ActionScaling``) come after it. L1 rejects a wrong order
+    that it can see. What it cannot see in the chain it notices at the next step: the observation
+    that it reads must be the one that it passed on, and its state that of the last step. A change
+    of type or device is allowed.
 
-    No gradient flows through L1: what the environment receives does not depend on the policy's
-    action in the eyes of autograd.
+    No gradient flows through L1: to autograd, what the environment receives does not depend on the
+    policy's action.
 
-    Action bounds that the configuration leaves open are taken from the action spec where it
-    is bounded; infinite bounds in the configuration turn clipping off.
+    Action bounds that the configuration leaves open are taken from the action spec if it is
+    bounded; infinite bounds in the configuration turn clipping off.
 
-    The model is referred to, not registered: it keeps its train mode and device, its weights
-    are not in the environment's ``state_dict``, and updating them in place is seen at the next
-    step. Processes of a ``ParallelEnv`` of transformed environments hold copies; keep L1 outside
-    of it while the model is being trained.
+    The model is referenced, not registered: it keeps its train mode and device, its weights are not
+    in the environment's ``state_dict``, and in-place updates take effect at the next step. Worker
+    processes of a ``ParallelEnv`` of transformed environments hold copies; keep L1 outside it while
+    the model is being trained.
 
     Args:
         dynamics: the learned model, see :class:`~torchrl_l1.control.ActionJacobian`; an
             ``ActionJacobian`` is used as it is.
-        config: the settings; or give ``dt`` and others of :class:`L1Config`'s here.
+        config: the settings; alternatively give ``dt`` and other fields of :class:`L1Config` here.
         dt: time of one environment step in seconds; the environment's own if ``None``, see
             :func:`~torchrl_l1.control.time_step`.
         observation_key: key of the observation.
         action_key: key of the action.
-        key: name of the nested tensordict with the controller's entries.
-        compile: ``True`` compiles the step, which takes some tens of seconds at the first;
-            ``"auto"`` does so where a compiler works.
+        key: name of the nested tensordict that holds the controller's entries.
+        compile: ``True`` compiles the step, which makes the first step take some tens of seconds;
+            ``"auto"`` does so if a compiler works.
         diagnostics: whether to write the diagnostics.
-        dtype: type in which the controller computes; that of the model's parameters if
-            ``None``, or the observation's for a model without any.
+        dtype: type in which the controller computes; if ``None``, that of the model's parameters,
+            or the observation's for a model without any.
         predicts: what ``dynamics`` predicts, ``"change"`` or ``"next_observation"``; ``None``
             decides as :class:`~torchrl_l1.control.ActionJacobian` does.
-        out_key: key of the prediction of a model with several, likewise.
-        ensemble_dim: dimension of its output over which the mean is taken, likewise.
-        check_dt: whether ``dt`` must be that of an environment which tells its own.
+        out_key: key of the prediction, for a model with several output keys.
+        ensemble_dim: output dimension over which the mean is taken, for a model that returns one
+            prediction per ensemble member.
+        check_dt: whether ``dt`` must match that of an environment that declares one.
         check: whether each step checks that the observation and the controller's state are those
-            that the last one gave; switch it off where you edit them on purpose.
+            from the previous step; turn it off to edit them on purpose.
         **settings: further fields of :class:`L1Config` (``epsilon``, ``cutoff``, ...).
 
     Raises:
-        ValueError: if a setting, a width, the time step or the order of transforms does not fit,
-            at a reset to an observation that is not finite, or at a step whose observation or
-            state is not what the last one gave.
+        ValueError: if a setting, a width, the time step or the order of transforms does not fit; at
+            a reset to an observation that is not finite; or at a step whose observation or state is
+            not that of the previous step.
         KeyError: at a step, if the observation, the action or the controller's state is missing.
         RuntimeError: if used in a replay buffer.
 
@@ -181,23 +182,24 @@ class L1Transform(Transform):
         """The settings.
 
         Raises:
-            ValueError: if the time step is the environment's and there is none yet.
+            ValueError: if the time step is the environment's, and there is none yet.
         """
         if not self._settings.is_complete:
             raise ValueError(
-                "L1Transform knows dt once an environment is reset that tells it: give dt otherwise"
+                "L1Transform knows dt only once an environment that declares it is reset: give "
+                "dt otherwise"
             )
         return self._settings.config
 
     def set_container(self, container: Transform | EnvBase) -> None:
-        """Attach to an environment, whose specs then decide widths and bounds."""
+        """Attach to an environment, whose specs then determine widths and bounds."""
         self._forget()
         super().set_container(container)
         if self._is_in_environment():
             self._check_order()
 
     def empty_cache(self) -> None:
-        """Forget what the specs decided: a transform before this one may have changed them."""
+        """Forget what came from the specs: a transform before this one may have changed them."""
         self._forget()
         super().empty_cache()
 
@@ -211,8 +213,8 @@ class L1Transform(Transform):
         self._check_order()
         if observation_spec.get(self.key, None) is not None:
             raise ValueError(
-                f"the environment has entries under {self.key!r} already, of another controller? "
-                "Give L1Transform a key of its own"
+                f"the environment already has entries under {self.key!r}, of another controller? "
+                "Give L1Transform its own key"
             )
         layout = self._resolve()
         observation_spec[self.key] = layout.spec(self._settings.config, self.diagnostics)
@@ -224,7 +226,7 @@ class L1Transform(Transform):
         return state_spec
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Refused: L1 acts at the steps of an environment, not on stored data."""
+        """Rejected: L1 acts at the steps of an environment, not on stored data."""
         raise RuntimeError(
             "L1Transform acts inside an environment: append it to a TransformedEnv, not to a "
             "replay buffer. Stored data already hold the executed input, under "
@@ -233,7 +235,8 @@ class L1Transform(Transform):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self._layout is None or not self._is_ready:
-            # After copying, or when a transform before this one came or went without a reset.
+            # After copying, or when a transform before this one was added or removed without a
+            # reset.
             if not self._is_in_environment():
                 return self.forward(tensordict)
             self._complete()
@@ -257,14 +260,14 @@ class L1Transform(Transform):
         )
         if self.check and not torch.compiler.is_compiling():
             self._check_repeated(ahead.seal)
-        # What is at hand need not be read again.
+        # Values already at hand need not be read again.
         self._last.ahead = None if torch.compiler.is_compiling() else ahead
         # The caller's tensordict keeps the policy's action: this one is a shallow copy.
         tensordict.set(self.action_key, ahead.executed)
         return tensordict.set(self._pending, ahead.following)
 
     def _check_repeated(self, seal: Tensor | None) -> None:
-        """Refuse to go on where each step was taken twice, as by a FrameSkipTransform around."""
+        """Reject a step taken twice each time, as by a FrameSkipTransform around."""
         last = self._last
         if seal is None or last.emitted is None or not self._is_stateful:
             return
@@ -290,7 +293,7 @@ class L1Transform(Transform):
             previous = tensordict.get(self.key).select(*following.keys(), strict=False)
             following = following.where(stepped.reshape(following.batch_size), previous, pad=0)
             state = None
-        # Environments may go on without being asked: the seal is on what came out.
+        # Environments may continue without asking: the seal is on what came out.
         self._seal(following, next_tensordict.get(self.observation_key), state)
         return next_tensordict.set(self.key, following)
 
@@ -308,7 +311,7 @@ class L1Transform(Transform):
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        # Here nothing is merged afterwards, and the mask says which rows are new.
+        # Nothing is merged afterwards here, and the mask says which rows are new.
         nested = tensordict_reset.get(self.key)
         reset = tensordict.get("_reset").reshape(nested.batch_size)
         fresh = self._fresh(tensordict_reset)
@@ -327,13 +330,13 @@ class L1Transform(Transform):
         if lacking:
             raise ValueError(
                 f"a batched environment would lose {lacking} of L1Transform, which a later "
-                f"transform takes from the specs: add {self.key!r} to its SelectTransform"
+                f"transform removes from the specs: add {self.key!r} to its SelectTransform"
             )
 
     def _fresh(self, tensordict_reset: TensorDictBase) -> TensorDictBase:
         batch_size, kept = tensordict_reset.batch_size, self._zero
         layout, config = self._resolve(), self._settings.config
-        # Kept, since some environment of a batch is reset at every other step.
+        # Kept, since some environment of a batch is reset every few steps.
         if kept is None or kept[:2] != (layout, config) or kept[2].batch_size != batch_size:
             kept = self._zero = layout, config, layout.zero(batch_size, config, self.diagnostics)
         fresh = kept[2].clone()
@@ -343,7 +346,7 @@ class L1Transform(Transform):
     def _seal(
         self, nested: TensorDictBase, observation: Tensor, state: L1State | None = None
     ) -> None:
-        """Write the seal beside the state, which is read there if not given."""
+        """Write the seal beside the state, reading the state there if not given."""
         if state is None:
             found = dict(nested.items())
             state = L1State(**{name: found[name] for name in self._state_names})
@@ -362,13 +365,13 @@ class L1Transform(Transform):
             dimensions = layout.observation_dim, layout.action_dim
             layout.bounded(self._settings.config).check_dimensions(*dimensions)
             self.model.check_dimensions(*dimensions)
-            # An environment with its state in the tensordict may step from any state, also twice.
+            # An environment with its state in the tensordict may step from any state, even twice.
             self._is_stateful = not list(parent.base_env.full_state_spec.keys(True, True))
             self._layout, self._is_ready, self._zero = layout, False, None
         return self._layout
 
     def _complete(self) -> None:
-        """Make the step, now that the environment runs and tells what it has to tell."""
+        """Make the step function, now that the environment runs and its properties are known."""
         if self._layout is not None and self._is_ready:
             return
         layout, parent = self._resolve(), self.parent
@@ -388,12 +391,12 @@ class L1Transform(Transform):
         self._is_ready = True
 
     def _check_dtype(self) -> None:
-        """Refuse a model of another type than that of which the specs are."""
+        """Reject a model whose type is not the one in the specs."""
         now, layout = self.model.dtype, self._resolve()
         if self.dtype is None and now not in (None, layout.dtype):
             raise ValueError(
                 f"the model is of {now} and was of {layout.dtype} when L1Transform came into the "
-                "environment: convert it before, or make the environment anew"
+                "environment: convert it first, or create the environment again"
             )
 
     def _check_order(self) -> None:
@@ -422,7 +425,7 @@ class L1Transform(Transform):
         return f"{type(self).__name__}(config={self._settings.config}, key={self.key!r})"
 
     def __getstate__(self) -> dict[str, Any]:
-        # Compiled functions do not travel between processes.
+        # Compiled functions cannot be sent to other processes.
         empty = {
             "_step_function": None,
             "_layout": None,

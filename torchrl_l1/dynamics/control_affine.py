@@ -16,14 +16,14 @@ from torchrl_l1.dynamics.storage import stored_as
 class ControlAffineDynamics(EnsembleDynamics):
     r"""Control-affine ensemble model, :math:`x_{t+1} - x_t = f(x_t) + G(x_t)\, u_t`.
 
-    Each member is a network of the observation alone, with the offset :math:`f` and the columns
-    of the gain :math:`G` as its outputs: ``n + n m`` of them for the deterministic head, twice as
-    many for the Gaussian one, whose raw log-variance then is affine in the action too. In
-    arXiv 2403.14860, figure 2, whose baseline this is, they are two networks. All else is as in
-    :class:`EnsembleDynamics`: arguments, normalisers, data box, members, fit. The Jacobian is
-    the ensemble's mean gain whatever the action, so the switching law never fires.
+    Each member is a network of the observation alone, whose outputs are the offset :math:`f` and
+    the columns of the gain :math:`G`: ``n + n m`` outputs for the deterministic head, twice as many
+    for the Gaussian one, whose raw log-variance is then affine in the action too. In arXiv
+    2403.14860, figure 2, whose baseline this is, they are two networks. Everything else is as in
+    :class:`EnsembleDynamics`: arguments, normalisers, data box, members, fit. The Jacobian is the
+    ensemble's mean gain whatever the action, so the switching law never triggers.
 
-    ``hidden`` is taken as it is; :func:`~torchrl_l1.dynamics.make_dynamics` matches the number
+    ``hidden`` is used as it is; :func:`~torchrl_l1.dynamics.make_dynamics` matches the number
     of parameters to that of an :class:`EnsembleDynamics`.
 
     Examples:
@@ -43,11 +43,11 @@ class ControlAffineDynamics(EnsembleDynamics):
         return EnsembleMLP(n, (1 + m) * self.head.out_features(n), hidden, members, activation)
 
     def network_inputs(self, inputs: Tensor) -> Tensor:
-        """What of :meth:`normalize_inputs` the network reads: the observation."""
+        """The part of :meth:`normalize_inputs` that the network reads: the observation."""
         return self._split(inputs)[0]
 
     def raw_from_output(self, output: Tensor, inputs: Tensor) -> Tensor:
-        """What the head makes sense of: all of it is affine in the action, mean or not."""
+        """The head's input: all of it is affine in the action, mean or not."""
         _, action = self._split(inputs)
         return affine_output(*affine_coefficients(output, self.action_dim), action)
 
@@ -74,7 +74,7 @@ class ControlAffineDynamics(EnsembleDynamics):
     def expansion(
         self, observation: Tensor, u_bar: Tensor, candidate: Tensor, tested: Tensor
     ) -> tuple[Tensor, Callable[[Tensor], tuple[Tensor, Tensor]]]:
-        """As in :class:`EnsembleDynamics`; the expansion at ``u_bar`` never fails."""
+        """As in :class:`EnsembleDynamics`; the expansion at ``u_bar`` is exact."""
 
         def at(moved: Tensor) -> tuple[Tensor, Tensor]:
             return self.value_and_jacobian(observation, torch.where(moved, candidate, u_bar))
@@ -90,7 +90,7 @@ class ControlAffineDynamics(EnsembleDynamics):
 
 
 def affine_coefficients(output: Tensor, action_dim: int) -> tuple[Tensor, Tensor]:
-    """Offset ``(..., out)`` and transposed gain ``(..., m, out)``, of ``(..., (1 + m) out)``."""
+    """Offset ``(..., out)`` and transposed gain ``(..., m, out)``, from ``(..., (1 + m) out)``."""
     rows = output.unflatten(-1, (1 + action_dim, -1))
     return rows[..., 0, :], rows[..., 1:, :]
 

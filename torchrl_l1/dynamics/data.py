@@ -1,4 +1,4 @@
-"""Recorded data of other kinds, as tensordicts of transitions such as TorchRL's collectors make."""
+"""Recorded data from other sources, as tensordicts like those of TorchRL's collectors."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 _Path = str | os.PathLike[str]
 
-# What an array of all that is observed is called, whatever the parts are.
+# Name of the whole observation in error messages, whatever its parts.
 _ALL_OF_IT = ("observation", "obs", "state")
 
-# Steps of time that differ by more from the usual one are gaps.
+# Time steps that differ from the usual one by more than this are gaps.
 _JITTER = 0.1
 
 
@@ -45,37 +45,36 @@ def read_csv(
     time: str | None = None,
     delimiter: str = ",",
 ) -> TensorDict:
-    r"""Transitions of a real system from a table, one line per sampling instant.
+    r"""Transitions of a real system from a table with one line per sampling instant.
 
-    A line holds what was measured and the action that was sent to the actuators from then until
-    the next line. Two lines that follow each other in an episode make one transition, so that the
-    action of the last line of an episode is not used. Empty cells count as NaN; what is done
-    with them is up to the reader of the transitions, such as
-    :func:`~torchrl_l1.dynamics.fit_dynamics`.
+    A line holds what was measured and the action that was sent to the actuators from then until the
+    next line. Two consecutive lines of an episode make one transition, so the action in the last
+    line of an episode is not used. Empty cells become NaN; how to treat them is up to the reader of
+    the transitions, such as :func:`~torchrl_l1.dynamics.fit_dynamics`.
 
     Args:
-        path: of the file, its first line the names of the columns.
+        path: path of the file, whose first line holds the names of the columns.
         observation: columns of the observation, n of them.
         action: columns of the action, m of them.
-        episode: column that numbers or names the episodes; one episode if ``None``. Rows of
-            several may alternate. Where a name comes back after longer blocks of others, as in
-            files that were joined, a new episode begins with a warning, unless there is a time.
-        time: column of the time, s. Where it goes back a new episode begins, as it does with a
-            warning where a step is not the usual one to within a tenth: a gap.
-        delimiter: between the cells.
+        episode: column that numbers or names the episodes; one episode if ``None``. Rows of several
+            episodes may alternate. If a name comes back after longer blocks of others, as in files
+            that were joined, a new episode begins with a warning, unless there is a time.
+        time: column of the time, s. A new episode begins where the time goes back and, with a
+            warning, at a gap: where a step differs from the usual one by more than a tenth.
+        delimiter: separator of the cells.
 
     Returns:
-        ``observation`` ``(N, n)``, ``action`` ``(N, m)``, flags, what follows under ``"next"``,
-        ``("collector", "traj_ids")`` and with a column of time ``dt`` ``(N, 1)``, the usual step;
-        batch size ``[N]``, float64.
+        ``observation`` ``(N, n)``, ``action`` ``(N, m)``, flags, the next observation under
+        ``"next"``, ``("collector", "traj_ids")`` and, with a time column, ``dt`` ``(N, 1)``, the
+        usual step; batch size ``[N]``, float64.
 
     Raises:
         FileNotFoundError: if there is no such file.
         KeyError: if there is no such column.
-        ValueError: for a cell that is no number, a line with more cells than there are columns or
-            without its episode, if no two lines follow each other, or if a column that is not
-            named, such as ``done``, ``is_first``, ``run`` or ``time``, tells of ends between lines
-            that would follow each other, or one like ``next_angle`` that they do not.
+        ValueError: for a cell that is not a number, a line with more cells than columns or without
+            its episode; if no two lines are consecutive; if a column you did not name, such as
+            ``done``, ``is_first``, ``run`` or ``time``, indicates an episode end between lines read
+            as consecutive; or if one like ``next_angle`` contradicts their order.
 
     Examples:
         >>> from pathlib import Path
@@ -92,15 +91,15 @@ def read_csv(
     """
     observation, action = _listed(observation), _listed(action)
     if not observation or not action:
-        raise ValueError("observation and action need the name of a column each")
+        raise ValueError("observation and action need the name of at least one column each")
     numbers = [*observation, *action, *([] if time is None else [time])]
     wanted = [*numbers, *([] if episode is None else [episode])]
     try:
         columns = _columns(path, wanted, numbers, observation, delimiter)
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is no text in UTF-8 ({error.reason}): save it as such") from None
+        raise ValueError(f"{path} is not text in UTF-8 ({error.reason}): save it as such") from None
     except csv.Error as error:
-        raise ValueError(f"{path} is no table of text: {error}") from None
+        raise ValueError(f"{path} is not a table of text: {error}") from None
     told = {
         name: np.array(cells)
         for name, cells in columns.items()
@@ -132,21 +131,21 @@ def read_npz(
 ) -> TensorDict:
     """As :func:`read_csv`, from arrays saved by :func:`numpy.savez`.
 
-    Arrays are ``(T,)`` or ``(T, k)``, one row per sampling instant; several are put side by side.
-    The observations may have one row more than the actions, the last one of a single episode.
+    Arrays are ``(T,)`` or ``(T, k)``, one row per sampling instant; several are concatenated. The
+    observations may have one row more than the actions: the last one of a single episode.
 
     Args:
-        path: of the file.
+        path: path of the file.
         observation: names of the arrays that make up the observation.
-        action: names of those that make up the action.
+        action: names of the arrays that make up the action.
         episode: name of the array that numbers the episodes ``(T,)``; one episode if ``None``.
-        time: name of the array of the time ``(T,)``, s.
+        time: name of the array of times ``(T,)``, s.
 
     Raises:
         FileNotFoundError: if there is no such file.
         KeyError: if there is no such array.
-        ValueError: if arrays are not numbers of one length, if the file is none of NumPy's, or for
-            several episodes as there.
+        ValueError: if the arrays are not numbers of one length, if the file is not one of NumPy's,
+            or as in :func:`read_csv` for several episodes.
     """
     try:
         file = np.load(path, allow_pickle=False)
@@ -163,9 +162,9 @@ def read_npz(
                 "it has arrays of objects, which are pickles: save arrays of numbers, episodes one "
                 "after the other, and an array that numbers them"
             )
-        elif "pickle" in str(error):  # what NumPy takes all else for
+        elif "pickle" in str(error):  # as which NumPy treats everything else
             why = "numpy.savez did not write it"
-        raise ValueError(f"{path} is no readable .npz file: {why}") from None
+        raise ValueError(f"{path} is not a readable .npz file: {why}") from None
 
     def array(name: str) -> np.ndarray:
         if name not in arrays:
@@ -224,14 +223,13 @@ def read_minari(dataset: str | MinariDataset, download: bool = False) -> TensorD
 
     Args:
         dataset: name of a dataset, such as ``"mujoco/inverteddoublependulum/medium-v0"``, or the
-            dataset itself, of which :meth:`~minari.MinariDataset.filter_episodes` may have left a
-            part.
-        download: whether to fetch it if it is not on this machine.
+            dataset itself, perhaps reduced by :meth:`~minari.MinariDataset.filter_episodes`.
+        download: whether to download it if it is not on this machine.
 
     Returns:
-        ``observation``, ``action``, ``reward``, flags and what follows under ``"next"``,
-        ``("collector", "traj_ids")``; batch size ``[N]``. The entries of a dictionary of
-        observations have their own keys, as in TorchRL's ``GymEnv``.
+        ``observation``, ``action``, ``reward``, flags and what followed under ``"next"``,
+        ``("collector", "traj_ids")``; batch size ``[N]``. The entries of dictionary observations
+        have their own keys, as in TorchRL's ``GymEnv``.
 
     Raises:
         FileNotFoundError: if the dataset is not on this machine.
@@ -275,27 +273,27 @@ def _columns(
     observation: Sequence[str],
     delimiter: str,
 ) -> dict[str, list[Any]]:
-    """Columns of a table by name; those of ``numbers`` as numbers, empty cells as NaN.
+    """Columns of a table by name; those in ``numbers`` as numbers, with empty cells as NaN.
 
-    Those too that tell the ends of episodes, and what followed an observation.
+    Also columns that indicate the ends of episodes, or what followed an observation.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file{', but a folder' * Path(path).is_dir()}")
     if len(delimiter) != 1:
         raise ValueError(f"{path}: the delimiter is one character, like '\\t', got {delimiter!r}")
-    # A byte order mark is none of the first column's name.
+    # A byte order mark is not part of the first column's name.
     with open(path, newline="", encoding="utf-8-sig") as file:
-        # Spaces after a delimiter keep quotes from being seen, and are themselves delimiters.
+        # Spaces after a delimiter would hide quotes; they may be delimiters themselves.
         lines = csv.reader(file, delimiter=delimiter, skipinitialspace=True)
         header = [name.strip() for name in next(filter(None, lines), [])]
         if any("\0" in name for name in header):
-            raise ValueError(f"{path} is no text: save the table as CSV")
+            raise ValueError(f"{path} is not text: save the table as CSV")
         if header:
             header[0] = header[0].removeprefix("#").strip()
         for name in wanted:
             if name not in header:
                 there = ", ".join(header) or "no first line"
-                hint = "" if len(header) > 1 else f", cells taken to be apart by {delimiter!r}"
+                hint = "" if len(header) > 1 else f", with cells separated by {delimiter!r}"
                 other = next((mark for mark in (";", "\t", ",") if hint and mark in there), None)
                 hint += f"; give delimiter={other!r}" if other else ""
                 raise KeyError(f"{path} has no column {name!r}, only {there}{hint}")
@@ -324,13 +322,13 @@ def _columns(
                     try:
                         columns[name].append(_number(cell))
                     except ValueError:
-                        remedy = "where there is no value, the cell is empty"
+                        remedy = "leave the cell empty if there is no value"
                         if re.fullmatch(r"[-+]?\d*,\d+", cell):
-                            remedy = "decimals stand behind a point"
+                            remedy = "use a point before the decimals"
                         elif re.search(r"\d:\d", cell):
-                            remedy = "a time is a number of seconds"
+                            remedy = "give times in seconds"
                         raise ValueError(
-                            f"{path}, line {lines.line_num}, column {name!r}: {cell!r} is no "
+                            f"{path}, line {lines.line_num}, column {name!r}: {cell!r} is not a "
                             f"number; {remedy}"
                         ) from None
                 else:
@@ -339,7 +337,7 @@ def _columns(
 
 
 def _number(cell: str) -> float:
-    if "_" in cell:  # which Python takes for a separator of digits
+    if "_" in cell:  # which Python accepts between digits
         raise ValueError
     return float(cell or "nan")
 
@@ -349,12 +347,12 @@ def _listed(names: str | Sequence[str] | None) -> list[str]:
 
 
 def _episodes(path: str, labels: np.ndarray) -> Tensor:
-    """Numbers of the episodes that rows are labelled with."""
+    """Numbers of the episodes by which the rows are labelled."""
     missing = np.array([str(label).lower() in ("", "nan") for label in labels.tolist()], dtype=bool)
     if missing.any():
         raise ValueError(
-            f"{path}: {int(missing.sum())} of {len(labels)} rows name no episode, row "
-            f"{int(missing.argmax()) + 1} first: fill that in, or leave them out"
+            f"{path}: {int(missing.sum())} of {len(labels)} rows name no episode, first row "
+            f"{int(missing.argmax()) + 1}: fill that in, or leave them out"
         )
     return torch.from_numpy(np.unique(labels, return_inverse=True)[1].reshape(-1))
 
@@ -368,7 +366,7 @@ def _rows(
     told: Mapping[str, np.ndarray],
     following: Mapping[str, tuple[Tensor, Tensor]],
 ) -> TensorDict:
-    """Transitions between rows that follow each other."""
+    """Transitions between consecutive rows."""
     ends = told_ends(told, len(x), labels is not None)
     ids = torch.zeros(len(x), dtype=torch.long)
     blocks, order = ids, torch.arange(len(x))
@@ -379,13 +377,13 @@ def _rows(
         ids = _episodes(path, labels)
         blocks[1:] = (ids[1:] != ids[:-1]).cumsum(0)
         again = int(blocks[-1]) + 1 - len(ids.unique())
-        # Rows of episodes that were recorded at once alternate; joined files have long blocks.
+        # Rows of episodes recorded at the same time alternate; joined files have long blocks.
         if clock is not None or 4 * int(blocks[-1] + 1) > len(ids):
             blocks = torch.zeros_like(ids)
         elif again:
             warnings.warn(
                 f"{path}: names of episodes come back {again} times after others: a new episode "
-                "begins at each; give every episode a name of its own",
+                "begins at each; give every episode its own name",
                 stacklevel=3,
             )
         order = ids.argsort(stable=True)
@@ -405,7 +403,7 @@ def _rows(
         after[: len(then)] = then[: len(now)]
         check_follows(path, name, now[order], after[order], joined)
     if not joined.any():
-        raise ValueError(f"{path} has {len(x)} rows, of which none follows another in its episode")
+        raise ValueError(f"{path} has {len(x)} rows, none of which follows another in its episode")
     trajectory = torch.cat([torch.zeros(1, dtype=torch.long), (~joined).cumsum(0)])
     last = torch.ones_like(joined)
     last[:-1] = ~joined[1:]
@@ -420,15 +418,15 @@ def _rows(
 
 
 def _steps(path: str, clock: Tensor, joined: Tensor) -> tuple[float, Tensor]:
-    """The usual step of time, s, and which rows are followed by the next one after that."""
+    """The usual time step, s, and which rows are followed by the next one after that step."""
     steps = clock.diff()
-    # Rows of one time are a step of no length, and so a gap.
+    # Rows with equal times are a step of zero length, and so a gap.
     onward = joined & (steps >= 0)
     taken = steps[onward & (steps > 0)]
     if not len(taken):
         raise ValueError(
-            f"{path}: the time never goes on from one row to the next: sort the rows by it, or "
-            "look at what numbers the episodes"
+            f"{path}: the time never increases from one row to the next: sort the rows by it, or "
+            "check what numbers the episodes"
         )
     dt = float(taken.median())
     even = (steps - dt).abs() <= _JITTER * dt
@@ -439,11 +437,11 @@ def _steps(path: str, clock: Tensor, joined: Tensor) -> tuple[float, Tensor]:
         remedy = "resample to one sampling time"
         if 4 * back > int(onward.sum()):
             remedy = f"the time goes back {back} times, sort the rows by it"
-        raise ValueError(f"{path}: steps of time from {low:.4g} to {high:.4g} s: {remedy}")
+        raise ValueError(f"{path}: time steps from {low:.4g} to {high:.4g} s: {remedy}")
     if gaps:
         warnings.warn(
-            f"{path}: {gaps} steps of time are not {dt:.4g} s to within a tenth: a new episode "
-            "begins after each",
+            f"{path}: {gaps} time steps differ from {dt:.4g} s by more than a tenth: a new "
+            "episode begins after each",
             stacklevel=4,
         )
     return dt, joined & even
@@ -472,7 +470,7 @@ def _step(
     flags: Mapping[str, Tensor],
     reward: Tensor | None = None,
 ) -> TensorDict:
-    """One tensordict of what an environment says before and after a step."""
+    """One tensordict of an environment's outputs before and after a step."""
     after = {**flags, "done": flags["terminated"] | flags["truncated"]}
     following.update(after if reward is None else {**after, "reward": reward})
     before = {name: torch.zeros_like(value) for name, value in after.items()}
@@ -481,6 +479,6 @@ def _step(
 
 
 def _named(data: TensorDict) -> TensorDict:
-    """Time is what collectors call the last dimension."""
+    """Name the last dimension ``"time"``, as collectors do."""
     data.names = ["time"]
     return data

@@ -31,17 +31,17 @@ def _silu(z: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Activation(NamedTuple):
-    """An activation and what is computed with it.
+    """An activation with its derivative and in-place variants.
 
     Attributes:
         value: the activation.
-        value_and_derivative: it and its derivative.
-        in_place: it, written over what it is applied to. At the sizes of planning a fresh tensor
-            costs as much as the activation.
-        into: it, written into the second tensor.
-        one: what it maps to one, in bfloat16 too.
-        backward: the gradient by what it was applied to, written over the gradient by what came
-            of it, from that, the former and the latter.
+        value_and_derivative: the activation and its derivative.
+        in_place: the activation, overwriting its argument. At the sizes used in planning, a new
+            tensor costs as much as the activation.
+        into: the activation, written into the second tensor.
+        one: an input that it maps to one, in bfloat16 too.
+        backward: the gradient with respect to the input, overwriting the gradient with respect to
+            the output; takes the latter, the input and the output.
     """
 
     value: Callable[[Tensor], Tensor]
@@ -53,7 +53,7 @@ class Activation(NamedTuple):
 
 
 ALIGNMENT = 16
-"""Widths of hidden layers are filled up to multiples of this, where they are filled up."""
+"""Widths of hidden layers are padded to multiples of this where padding is used."""
 
 ACTIVATIONS: dict[str, Activation] = {
     "relu": Activation(
@@ -85,7 +85,7 @@ ACTIVATIONS: dict[str, Activation] = {
         backward=lambda g, z, units: torch.ops.aten.silu_backward.grad_input(g, z, grad_input=g),
     ),
 }
-"""Those that hidden layers may have."""
+"""The activations that hidden layers may have."""
 
 
 def _entries(parameters: nn.ParameterList) -> list[Tensor]:
@@ -93,10 +93,10 @@ def _entries(parameters: nn.ParameterList) -> list[Tensor]:
 
 
 class EnsembleMLP(nn.Module):
-    """``members`` perceptrons of equal shape, their weights stacked along a leading dimension.
+    """``members`` perceptrons of equal shape, with weights stacked along a leading dimension.
 
     All members are evaluated by one batched matrix product per layer. Hidden layers share an
-    activation, the output is linear. Weights start Glorot-uniform, biases at zero, each member
+    activation; the output is linear. Weights start Glorot-uniform and biases at zero, each member
     with its own draw.
 
     Args:
@@ -161,15 +161,15 @@ class EnsembleMLP(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Outputs and their derivatives with respect to the input columns ``first:last``.
 
-        The tangent of an input column passes the first layer as a row of its weights, whatever
-        the sample; from there on the ``d = last - first`` tangents of a sample travel through
-        each layer's matrix product together with its value, so the cost is that of about
-        ``1 + d`` forward passes without the first layer.
+        In the first layer, the tangent of an input column is a row of the weights, whatever the
+        sample. From there on the ``d = last - first`` tangents of a sample pass through each
+        layer's matrix product together with its value, so the cost is that of about ``1 + d``
+        forward passes without the first layer.
 
         Args:
             x: inputs ``(B, in)``.
             first: first column differentiated.
-            last: column after the last one differentiated.
+            last: one past the last column differentiated.
 
         Returns:
             outputs ``(E, B, out)`` and derivatives ``(E, B, d, out)``.
@@ -189,12 +189,12 @@ class EnsembleMLP(nn.Module):
         return z, tangent
 
     def taylor_remainder(self, x: Tensor, step: Tensor) -> Tensor:
-        """What the tangent at ``x`` misses at ``x + step``: the remainder of first order.
+        """Error of the tangent at ``x`` for ``x + step``: the first-order Taylor remainder.
 
-        The input layer is linear, so its output at ``x + step`` is a sum of two that are needed
-        anyway; the output layer is linear, so it acts on the remainder of the last hidden layer.
-        In between, value, tangent and displaced value travel together: three forward passes
-        without those two layers.
+        The input layer is linear, so its output at ``x + step`` is a sum of two outputs that are
+        needed anyway; the output layer is linear, so it acts on the remainder of the last hidden
+        layer. In between, value, tangent and displaced value pass through together: three forward
+        passes without those two layers.
 
         Args:
             x: inputs ``(B, in)``.
@@ -224,25 +224,24 @@ class EnsembleMLP(nn.Module):
     def expansion(
         self, x: Tensor, first: int, last: int
     ) -> tuple[Tensor, Callable[[Tensor], tuple[Tensor, Tensor]]]:
-        """The expansion of first order at one of two inputs, tested at a third.
+        """First-order expansion at one of two inputs, tested at a third.
 
-        The three travel through the network together, with the tangent from the first to the
-        last. The derivatives are those of the input that is selected only, and reuse its
-        activations.
+        The three pass through the network together, with the tangent from the first to the last.
+        The derivatives are only those at the selected input, and reuse its activations.
 
         Args:
-            x: the input expanded at, the one that may take its place and the one tested,
-                ``(3, B, in)``; they differ in the columns ``first:last`` at most.
+            x: the input of the expansion, its alternative and the tested one, ``(3, B, in)``; they
+                may differ only in the columns ``first:last``.
             first: first column differentiated.
-            last: column after the last one differentiated.
+            last: one past the last column differentiated.
 
         Returns:
-            what the expansion at the first input misses at the third ``(E, B, out)``, and a
+            the error of the expansion at the first input for the third ``(E, B, out)``, and a
             function of a mask ``(B,)``, true where the second is selected, which gives outputs
             ``(E, B, out)`` and derivatives ``(E, B, d, out)`` there.
         """
         activation, batch = ACTIVATIONS[self.activation].value_and_derivative, x.shape[1]
-        # Once each: a ParameterList takes as long to read as a small sum, each entry of it.
+        # Once each: reading a ParameterList entry takes as long as a small sum.
         weights, biases = _entries(self.weights), _entries(self.biases)
         thirds = [batch, batch, batch]
         hidden = x.flatten(0, 1).expand(weights[0].shape[0], -1, -1)
@@ -261,7 +260,7 @@ class EnsembleMLP(nn.Module):
             tangent.mul_(derivative[:, :batch])
         at_first, _, at_tested = hidden.split_with_sizes(thirds, 1)
         remainder = at_tested - at_first
-        # Without hidden layers the tangent misses nothing.
+        # Without hidden layers the tangent is exact.
         remainder = remainder - (tangent if derivatives else remainder)
 
         def at(moved: Tensor) -> tuple[Tensor, Tensor]:

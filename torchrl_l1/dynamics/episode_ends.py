@@ -1,4 +1,4 @@
-"""What columns of a file that nobody named tell of where its rows do not follow each other."""
+"""What columns that nobody named reveal about rows that do not follow each other."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Mapping
 import numpy as np
 from torch import Tensor
 
-# What flags of an episode's end are called, by D4RL, Minari, Gymnasium and TorchRL among others,
-# those of its start, and what numbers it.
+# Names of flags of an episode's end, used by D4RL, Minari, Gymnasium and TorchRL among others, of
+# flags of its start, and of columns that number episodes.
 _ENDS = re.compile(r"(is_)?(done|terminal|terminated|termination|timeout|truncated|truncation)s*")
 _STARTS = re.compile(r"(is_)?(reset|new_episode|episode_start)s?|is_(first|init)")
 _NUMBERS = re.compile(
@@ -19,21 +19,21 @@ _TIMES = re.compile(r"time(stamp)?s?")
 
 _FALSE = ("", "false", "f", "no", "n", "none")
 
-# Observations that differ by less than this share of their spread are one, rounded twice.
+# Observations that differ by less than this share of their spread are equal up to rounding.
 _ROUNDING = 1e-5
 
-# A step of time that is so many times the usual one is no jitter.
+# A time step this many times the usual one is not jitter.
 _GAP = 10
 
 
 def tells_of_ends(name: str) -> bool:
-    """Whether a column of this name tells where episodes end."""
+    """Whether the name of a column means that it shows where episodes end."""
     kinds = (_ENDS, _STARTS, _NUMBERS, _TIMES)
     return any(kind.fullmatch(name.lower()) for kind in kinds)
 
 
 def tells_what_follows(name: str, observation: str) -> bool:
-    """Whether a column of this name holds what an observation was one step later.
+    """Whether the name of a column means that it holds an observation one step later.
 
     Examples:
         >>> tells_what_follows("next_observations", "observation"), tells_what_follows("x", "x")
@@ -47,12 +47,12 @@ def tells_what_follows(name: str, observation: str) -> bool:
 def told_ends(
     columns: Mapping[str, np.ndarray], count: int, numbered: bool
 ) -> dict[str, np.ndarray]:
-    """Rows that are the last of an episode, by the column that tells so.
+    """Rows that are the last of an episode, by the column that shows it.
 
     Args:
         columns: numbers or text, none of them empty.
-        count: rows of the file.
-        numbered: whether what numbers the episodes is named, so that other numbers do not count.
+        count: number of rows in the file.
+        numbered: whether a column that numbers the episodes is named, so that others do not count.
     """
     found = {}
     for name, values in columns.items():
@@ -71,7 +71,7 @@ def told_ends(
 
 
 def _is_set(flags: np.ndarray) -> np.ndarray:
-    """In which rows a flag is, however it is written."""
+    """Rows in which a flag is set, however it is written."""
     if flags.dtype.kind == "U":
         return np.array([any(map(_is_true, row)) for row in flags.tolist()], dtype=bool)
     return ((flags != 0) & (flags == flags)).any(-1)
@@ -86,7 +86,7 @@ def _is_true(cell: str) -> bool:
 
 
 def _breaks(clock: np.ndarray) -> np.ndarray:
-    """Where a time goes back, or on by much more than usual; nowhere if it is no number."""
+    """Rows where a time goes back, or jumps by much more than usual; none if it is not numeric."""
     try:
         steps = np.diff(clock.astype(np.float64))
     except ValueError:
@@ -96,52 +96,52 @@ def _breaks(clock: np.ndarray) -> np.ndarray:
 
 
 def check_ends(path: str, name: str, ends: np.ndarray) -> None:
-    """Refuse a file that tells of several episodes where it is to be read as one."""
+    """Reject a file that shows several episodes but would be read as one."""
     count = int(ends[:-1].sum())
     if count:
         raise ValueError(
-            f"{path} tells by {name!r} of {count} episodes that end before the last row, and would "
-            "be read as one: name what numbers them as episode, such as the running count of their "
-            "starts, or the time; or rename the column if it is of something else"
+            f"{path}: {name!r} shows {count} episodes that end before the last row, which would "
+            "be read as one: name as episode the column that numbers them, such as a running count "
+            "of their starts, or name the time; or rename the column if it holds something else"
         )
 
 
 def check_no_end_within(path: str, name: str, ends: Tensor, joined: Tensor) -> None:
-    """Refuse a file that tells of ends after which an episode would go on.
+    """Reject a file that shows ends of episodes where an episode would continue.
 
-    A flag may stand in the row whose action ended the episode, with the last observation behind
-    it, so that only a second row behind it is one too many.
+    A flag may stand in the row whose action ended the episode, followed by the last observation, so
+    only a second row after it is one too many.
     """
     count = int((ends[:-2] & joined[:-1] & joined[1:]).sum())
     if count:
         raise ValueError(
-            f"{path} tells by {name!r} of {count} ends within what episode and time say are single "
-            "episodes, and steps across them would be taken for the plant's: name what numbers "
-            "all episodes as episode, such as the running count of their starts; leave out rows "
-            "behind an end; or rename the column if it is of something else"
+            f"{path}: {name!r} shows {count} ends within single episodes according to episode and "
+            "time, and steps across them would be taken for the plant's: name as episode the "
+            "column that numbers all episodes, such as a running count of their starts; leave out "
+            "rows after an end; or rename the column if it holds something else"
         )
 
 
 def check_follows(path: str, name: str, now: Tensor, told: Tensor, joined: Tensor) -> None:
-    """Refuse a file that tells of rows that are not what followed the row before.
+    """Reject a file that shows that rows are not what followed the row before.
 
     Args:
-        path: of the file.
-        name: of the column that tells.
+        path: path of the file.
+        name: name of the column that shows it.
         now: the observation ``(T, k)``.
-        told: what the file says that it was one step later, ``(T, k)``.
-        joined: whether a row is taken for what followed the one before, ``(T - 1,)``.
+        told: the observation one step later, according to the file, ``(T, k)``.
+        joined: whether a row is read as following the one before, ``(T - 1,)``.
 
     Raises:
-        ValueError: if it is another in any row; values that are no numbers tell nothing.
+        ValueError: if they differ in any row; values that are not numbers are ignored.
     """
     spread = (now - now.nanmean(0)).square().nanmean(0).sqrt()
     apart = (now[1:] - told[:-1]).abs() > _ROUNDING * (spread + now[1:].abs())
     count = int((apart.any(-1) & joined).sum())
     if count:
         raise ValueError(
-            f"{path} has {name!r}, which is not what stands in the next row {count} times of "
-            f"{int(joined.sum())}: rows that do not follow each other are no steps of the plant; "
-            "name what numbers the episodes as episode, or, of rows in any order, make a "
-            "tensordict of observation, action and ('next', 'observation') and hand that over"
+            f"{path} has {name!r}, which differs from the next row {count} times out of "
+            f"{int(joined.sum())}: rows that do not follow each other are not steps of the plant; "
+            "name as episode the column that numbers them or, for rows in any order, make a "
+            "tensordict of observation, action and ('next', 'observation') and pass that"
         )

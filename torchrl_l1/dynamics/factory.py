@@ -1,4 +1,4 @@
-"""Making the model that a recipe names, at a size that makes models comparable."""
+"""Makes the model that a recipe names, at a size that makes models comparable."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def make_dynamics(
     head: str | Head = "deterministic",
     **settings: Any,
 ) -> EnsembleDynamics:
-    """An ensemble of the given form, of a size set by ``hidden`` whatever the form.
+    """An ensemble of the given form, with the size that ``hidden`` sets for every form.
 
     Args:
         observation_dim: number of observations, n.
@@ -35,7 +35,7 @@ def make_dynamics(
         settings: further arguments of :class:`EnsembleDynamics`.
 
     Raises:
-        ValueError: for another form or head.
+        ValueError: for an unknown form or head.
 
     Examples:
         >>> make_dynamics(4, 1, "affine", hidden=(128, 128)).network.weights[0].shape
@@ -57,9 +57,9 @@ def matched_hidden(
 ) -> list[int]:
     """Hidden widths of a control-affine network with as many parameters as a nonlinear one.
 
-    The control-affine network has 1 + m times the outputs, and m inputs less. All widths are
-    scaled by one factor, the one that brings the number of weights and biases closest to that
-    of a network from n + m inputs through ``hidden`` to the outputs.
+    The control-affine network has 1 + m times the outputs and m fewer inputs. All widths are scaled
+    by the one factor that brings the number of weights and biases closest to that of a network from
+    n + m inputs through ``hidden`` to the outputs.
 
     Args:
         observation_dim: number of observations, n.

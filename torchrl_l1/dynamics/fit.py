@@ -39,26 +39,27 @@ class FitConfig:
 
     Attributes:
         learning_rate: Adam's step size at the start of a fit.
-        final_learning_rate_fraction: the step size at the end as a fraction of that at the
-            start, reached linearly over the gradient steps that a fit may take.
+        final_learning_rate_fraction: the final step size as a fraction of the initial one, reached
+            linearly over the gradient steps that a fit may take.
         batch_size: transitions per member and gradient step.
-        max_epochs: passes over the training data.
-        max_gradient_steps: bound on gradient steps, whatever the number of epochs.
-        patience: epochs without a lower validation loss of any member before stopping.
-        validation_fraction: share of new transitions kept out of training for good.
+        max_epochs: maximum number of passes over the training data.
+        max_gradient_steps: maximum number of gradient steps, whatever the number of epochs.
+        patience: epochs without a lower validation loss of any member after which to stop.
+        validation_fraction: share of new transitions permanently kept out of training.
         weight_penalty: coefficient of half the squared hidden weights, divided by the number
             of training transitions.
-        weight_decay: coefficients of half the squared weights, one per layer from input to
-            output, biases excepted; none if empty. The authors of PETS write theirs beside
-            twice the negative log-likelihood, or half the squared error: half of each does the
-            same here with a Gaussian head, twice with a deterministic one.
-        bootstrap: whether each member trains on its own resample of the training transitions,
-            as many drawn with replacement, anew at each fit. They are validated on the same.
-        elites: number of members kept as the model's elites after the fit, those of the lowest
-            validation loss; if null the model's elites stay as they are.
-        precision: of the products of hidden units and of their gradients, ``float32``,
+        weight_decay: coefficients of half the squared weights, one per layer from input to output,
+            biases excepted; none if empty. The authors of PETS state theirs for twice the negative
+            log-likelihood, or half the squared error: half of each has the same effect here with a
+            Gaussian head, twice with a deterministic one.
+        bootstrap: whether each member trains on its own resample of the training transitions:
+            equally many, drawn with replacement for each fit. All members share the validation
+            data.
+        elites: number of members with the lowest validation loss that become the model's elites
+            after the fit; if null, the model's elites stay as they are.
+        precision: precision of the products of hidden units and of their gradients, ``float32``,
             ``bfloat16``, or ``auto`` for the faster one on this machine, see
-            :func:`~torchrl_l1.planning.resolve_precision`. Weights, moments of the optimizer and
+            :func:`~torchrl_l1.planning.resolve_precision`. Weights, optimizer moments and
             validation are always float32.
     """
 
@@ -95,7 +96,7 @@ FROM_SCRATCH: dict[str, Any] = {
     "patience": 10,
     "batch_size": 256,
 }
-"""Settings of a :class:`FitConfig` for a model that is fitted once, by :func:`fit_dynamics`."""
+""":class:`FitConfig` settings for a model that is fitted once, by :func:`fit_dynamics`."""
 
 
 @dataclass
@@ -103,11 +104,11 @@ class FitReport:
     """Outcome of a fit, averaged over the members.
 
     Attributes:
-        train_loss: running mean of the loss over the last epoch, while its weights changed.
-        validation_loss: loss of the weights that were kept.
+        train_loss: running mean of the loss over the last epoch, while the weights changed.
+        validation_loss: validation loss of the weights that were kept.
         epochs: passes over the training data.
         gradient_steps: gradient steps taken.
-        dropped: rows of the data that are no transitions of the system and were left out.
+        dropped: rows left out because they are not transitions of the system.
     """
 
     train_loss: float
@@ -129,30 +130,28 @@ def fit_ensemble(
 ) -> FitReport:
     """Fit all members at once, each on its own shuffle of the training data.
 
-    Normalisers and the data box are set from the training data first. The weights are warm:
-    they continue from where they are. Every member keeps the weights of the epoch with its
-    lowest validation loss, parameters that the members share those of the last epoch that was the
-    best for any of them.
+    Normalisers and the data box are first set from the training data. Training continues from the
+    current weights. Every member keeps the weights of the epoch with its lowest validation loss;
+    parameters that the members share keep those of the last epoch that was the best for any member.
 
     Args:
         dynamics: the model, changed in place.
-        data: transitions with ``observation_key``, ``action_key`` and
-            ``("next", observation_key)``: a replay buffer, a tensordict of any batch size or
-            several of them, see
-            :func:`~torchrl_l1.dynamics.read_transitions` for what of them is used. The flag
-            ``validation`` says what is kept out of training; without one trajectories are drawn.
+        data: transitions with ``observation_key``, ``action_key`` and ``("next",
+            observation_key)``: a replay buffer, a tensordict of any batch size or several of them;
+            :func:`~torchrl_l1.dynamics.read_transitions` says which rows are used. The flag
+            ``validation`` marks what is kept out of training; without it, trajectories are drawn.
         config: see :class:`FitConfig`.
-        optimizer: over ``dynamics.parameters()``; its moments persist between fits, its step sizes
-            are those of ``config`` in all of its groups.
+        optimizer: over ``dynamics.parameters()``; its moments persist between fits, and its step
+            sizes are set from ``config`` in all of its groups.
         action_key: ``"action"`` for the nominal label, ``"executed"`` for the executed one.
         on_epoch: called with the number of the finished epoch, for progress bars.
-        observation_key: of the observation; ``("next", observation_key)`` is the one that followed.
-        seed: of the draw of trajectories kept out of training.
+        observation_key: key of the observation; ``("next", observation_key)`` is the next one.
+        seed: seed for drawing the trajectories kept out of training.
 
     Raises:
         KeyError: if the data lack a key.
         ValueError: if there is nothing to train or to validate on, if shapes do not fit or if a
-            setting does not fit the model. The model is as it was then.
+            setting does not fit the model. The model is then unchanged.
     """
     check_fit(config, dynamics)
     fraction = config.validation_fraction
@@ -175,43 +174,43 @@ def fit_dynamics(
     on_epoch: Callable[[int], None] | None = None,
     **settings: Any,
 ) -> EnsembleDynamics:
-    """A model of the dynamics, fitted to data of one's own, and how good it is.
+    """A dynamics model fitted to your own data, with a measure of how good it is.
 
-    Where the data hold 20 steps in a row, what the robust controller needs to know of the model is
-    found as well, as by :func:`~torchrl_l1.dynamics.calibrate_filter` with the range of the
-    recorded actions as their bounds: call that again where the actuators reach further, or on data
-    without the disturbances that are to be cancelled.
+    If the data hold 20 steps in a row, this also finds the settings that the robust controller
+    takes from the model, like :func:`~torchrl_l1.dynamics.calibrate_filter` with the range of the
+    recorded actions as bounds. Call that again if the actuators reach further, or with data free of
+    the disturbances to be cancelled.
 
     Args:
         data: transitions as TorchRL makes them: a replay buffer, a tensordict of any batch size,
             or several of them, see :func:`~torchrl_l1.dynamics.read_transitions`.
-        observation_key: of the observation ``(..., n)``; ``("next", observation_key)`` is the one
-            that followed.
-        action_key: of what was sent to the actuators ``(..., m)``.
-        names: of the entries of the observation, for the report.
-        units: theirs.
-        config: how to fit; settings for one fit from scratch if ``None``: up to 3000 gradient
+        observation_key: key of the observation ``(..., n)``; ``("next", observation_key)`` is the
+            next one.
+        action_key: key of what was sent to the actuators ``(..., m)``.
+        names: names of the observation's entries, for the report.
+        units: units of the same.
+        config: how to fit; if ``None``, settings for one fit from scratch: up to 3000 gradient
             steps of 256 transitions.
-        seed: of weights, shuffles and the trajectories kept out of training. The global random
-            numbers stay as they are.
-        device: of the model; the CPU if ``None``.
+        seed: seed of weights, shuffles and the trajectories kept out of training. The global random
+            state stays as it is.
+        device: device of the model; the CPU if ``None``.
         on_epoch: called with the number of the finished epoch, for progress bars.
         settings: fields of :class:`FitConfig`, such as ``validation_fraction``, and arguments of
-            :func:`~torchrl_l1.dynamics.make_dynamics`, such as ``members``, ``head`` or
-            ``hidden``, here ``(128, 128)`` unless given.
+            :func:`~torchrl_l1.dynamics.make_dynamics`, such as ``members``, ``head`` or ``hidden``,
+            which is ``(128, 128)`` here by default.
 
     Returns:
-        the model, in evaluation mode, with its :attr:`~EnsembleDynamics.quality`, which prints as
-        a table.
+        the model, in evaluation mode, with its :attr:`~EnsembleDynamics.quality`, which prints as a
+        table.
 
     Warns:
         UserWarning: if rows of the data are left out, an entry of the action never varies, changes
-            are lost in the digits of large values, or the model is too poor for L1 to be of use.
+            are lost in the digits of large values, or the model is too poor for L1 to be useful.
 
     Raises:
         KeyError: if the data lack a key.
         TypeError: for a setting that does not exist.
-        ValueError: if the data do not suffice, or for shapes or settings that make no sense.
+        ValueError: if the data do not suffice, or shapes or settings make no sense.
 
     Examples:
         >>> import torch
@@ -241,7 +240,7 @@ def fit_dynamics(
     n, m = (transitions.data[key].shape[-1] for key in ("observation", "action"))
     entry_names(n, names, units)
     with torch.random.fork_rng(devices=[]):
-        torch.default_generator.manual_seed(int(seed))  # all draws are the CPU's
+        torch.default_generator.manual_seed(int(seed))  # all draws are made on the CPU
         dynamics = make_dynamics(n, m, **{"hidden": (128, 128), **settings}).to(here)
         transitions.warn_of_gaps(*keys, std_floor=dynamics.change_normalizer.std_floor)
         optimizer = torch.optim.Adam(dynamics.parameters(), lr=config.learning_rate)
@@ -256,10 +255,10 @@ def fit_dynamics(
 
 
 def _calibrate(dynamics: EnsembleDynamics, data: TensorDictBase) -> None:
-    """With the bounds that the data show; an entry that never varies has those of a unit."""
+    """The settings with bounds from the data; an entry that never varies gets unit bounds."""
     low, high = data["action"].amin(0), data["action"].amax(0)
     flat = (low == high).to(low)
-    # The filter works step by step: what the time step is does not matter.
+    # The filter works step by step, so the length of a time step does not matter.
     config = L1Config.robust(1.0, action_low=low - flat, action_high=high + flat)
     calibrate_filter(dynamics.residuals, dynamics.value_and_jacobian, data, config)
 
@@ -271,7 +270,7 @@ def fit_to_transitions(
     optimizer: torch.optim.Optimizer,
     on_epoch: Callable[[int], None] | None = None,
 ) -> FitReport:
-    """As :func:`fit_ensemble`, to transitions that have been read."""
+    """As :func:`fit_ensemble`, for transitions that have been read."""
     check_fit(config, dynamics)
     words = ("fit", "transitions", "fit.validation_fraction")
     train, validation = two_parts(transitions.data, transitions.validation, *words)
@@ -290,7 +289,7 @@ def fit_to_transitions(
     if config.elites is not None:
         dynamics.set_elites(best_loss.topk(config.elites, largest=False).indices)
     residual = one_step_residuals(dynamics, validation)
-    if bool(residual.isfinite().all()):  # else the loss tells that the fit diverged
+    if bool(residual.isfinite().all()):  # otherwise the loss shows that the fit diverged
         dynamics.residuals.measure(residual)
     return replace(report, dropped=transitions.dropped)
 
@@ -310,8 +309,8 @@ def train_members(
         model: changed in place; see :func:`fit_ensemble` for the weights that it ends with.
         inputs: normalised ``(N, in)``.
         target: normalised ``(N, out)``.
-        validate: losses of the members on what is kept out of training ``(E,)``.
-        config: see :class:`FitConfig`; elites and shares of the data do not matter here.
+        validate: losses of the members on the validation data ``(E,)``.
+        config: see :class:`FitConfig`; elites and shares of the data are not used here.
         optimizer: over the model's parameters.
         on_epoch: called with the number of the finished epoch.
 
@@ -363,7 +362,7 @@ def train_members(
     with torch.no_grad():
         for kept, parameter in zip(best_own + best_shared, own + shared, strict=True):
             parameter.copy_(kept)
-    if shared:  # the best weights of each member now meet parameters of another epoch
+    if shared:  # the best weights of each member are now paired with another epoch's parameters
         best_loss = validate()
     return best_loss, FitReport(
         train_loss=running.item() / (members * (batch + 1)),
@@ -383,18 +382,18 @@ def _check_widths(dynamics: EnsembleDynamics, data: TensorDictBase) -> None:
 
 
 def check_optimizer(optimizer: torch.optim.Optimizer, model: Members) -> None:
-    """Refuse one that would train nothing of the networks, such as that of their copy."""
+    """Reject an optimizer that would train none of the networks, such as one made for a copy."""
     known = {id(part) for group in optimizer.param_groups for part in group["params"]}
     trained = [part for part in model.network.parameters() if part.requires_grad]
     if trained and not any(id(part) in known for part in trained):
         raise ValueError(
-            "the optimizer holds no weights of this model, maybe those of another or of what it "
-            "was copied from: make one over this model's parameters()"
+            "the optimizer holds no weights of this model, maybe those of another model or of one "
+            "that it was copied from: make one over this model's parameters()"
         )
 
 
 def check_fit(config: FitConfig, dynamics: EnsembleDynamics) -> None:
-    """Refuse settings that do not fit the model, with a ``ValueError``."""
+    """Raise ``ValueError`` if settings do not fit the model."""
     check_decay(config, dynamics)
     members = dynamics.members
     if config.elites is not None and config.elites > members:
@@ -402,7 +401,7 @@ def check_fit(config: FitConfig, dynamics: EnsembleDynamics) -> None:
 
 
 def check_decay(config: FitConfig, model: Members) -> None:
-    """Refuse coefficients for other layers than the model's, with a ``ValueError``."""
+    """Raise ``ValueError`` if the coefficients are for other layers than the model's."""
     layers = len(model.network.weights)
     if config.weight_decay and len(config.weight_decay) != layers:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Functions that are given from outside, and the bounds of actions: their kinds and checks."""
+"""Functions supplied by users, and bounds of actions: their types and checks."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ Termination = Callable[[Tensor], Tensor]
 def checked_bounds(
     low: Tensor | float | Sequence[float], high: Tensor | float | Sequence[float], like: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Bounds of the action as ``(m,)``, in type and place those of actions ``(..., m)``.
+    """Bounds of the action as ``(m,)``, with the dtype and device of actions ``(..., m)``.
 
     Raises:
-        ValueError: if they are of another width, or leave no action between them.
+        ValueError: if they have another width, or leave no action between them.
     """
     width, bounds = like.shape[-1], []
     for name, bound in (("low", low), ("high", high)):
@@ -43,10 +43,10 @@ def checked_bounds(
 def finite_bounds(
     low: Tensor | float | Sequence[float], high: Tensor | float | Sequence[float], like: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """As :func:`checked_bounds`, for what draws actions between them.
+    """As :func:`checked_bounds`, for code that draws actions between them.
 
     Raises:
-        ValueError: also if they are infinite, or stand for it.
+        ValueError: also if they are infinite, or so large that they stand for it.
     """
     low, high = checked_bounds(low, high, like)
     for name, bound in (("low", low), ("high", high)):
@@ -59,10 +59,10 @@ def finite_bounds(
 
 
 def one_each(function: Callable[..., Tensor], name: str, *inputs: Tensor) -> Tensor:
-    """What a reward or a termination gives, which must be ``(...)`` for inputs ``(..., width)``.
+    """The result of a reward or termination, which must be ``(...)`` for inputs ``(..., width)``.
 
     Raises:
-        ValueError: naming the function, also where it writes to its inputs.
+        ValueError: naming the function; also if it writes to its inputs.
     """
     values, batch = untouched(function, name, *inputs), tuple(inputs[0].shape[:-1])
     found = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
@@ -75,21 +75,21 @@ def one_each(function: Callable[..., Tensor], name: str, *inputs: Tensor) -> Ten
 
 
 def untouched(function: Callable[..., Tensor], name: str, *inputs: Tensor) -> Tensor:
-    """What a function gives that may read its inputs only, which others go on to use.
+    """The result of a function that must not modify its inputs, since they are used again.
 
     Raises:
-        ValueError: naming the function, where it writes to one of them.
+        ValueError: naming the function, if it writes to one of them.
     """
     before = _writes(inputs)
     values = function(*inputs)
     if _writes(inputs) != before:
         raise ValueError(
-            f"the {name} function writes to what it is given in place, which is used afterwards: "
+            f"the {name} function writes to its inputs, which are used afterwards: "
             "let it work on a copy"
         )
     return values
 
 
 def _writes(tensors: Sequence[Tensor]) -> list[int]:
-    """How often each has been written to; those of inference mode do not count."""
+    """Write counts of tensors; those in inference mode do not count."""
     return [0 if tensor.is_inference() else tensor._version for tensor in tensors]

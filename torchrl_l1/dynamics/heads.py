@@ -1,4 +1,4 @@
-"""What the last layer of an ensemble member means: the head turns it into a prediction."""
+"""Heads of ensemble members, which turn the raw output of the last layer into a prediction."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ HEADS = ("deterministic", "gaussian")
 
 
 class Head(nn.Module, ABC):
-    """Meaning of a member's raw output for targets of ``dim`` columns, normalised units.
+    """Interpretation of a member's raw output for targets of ``dim`` columns, normalised units.
 
-    The predicted mean must be the first ``dim`` columns of the raw output, unchanged, so that
-    the Jacobian of the mean is that of those columns. The members of an ensemble share the
-    head, and with it the parameters that it may have.
+    The predicted mean must be the first ``dim`` columns of the raw output, unchanged, so that the
+    Jacobian of the mean is that of those columns. The members of an ensemble share the head, and
+    with it any parameters that it has.
     """
 
     @abstractmethod
@@ -35,22 +35,22 @@ class Head(nn.Module, ABC):
         """Predicted standard deviation of the target, ``(..., out)`` to ``(..., dim)``."""
 
     def penalty(self) -> Tensor | float:
-        """What the head's own parameters add to the objective of a fit, once per ensemble."""
+        """Penalty on the head's own parameters in the objective of a fit, once per ensemble."""
         return 0.0
 
     def loss_and_gradient(self, raw: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Losses of the members, and what a fit needs of the gradients of its objective.
+        """Losses of the members, and the gradients of its objective that a fit needs.
 
-        The objective is the sum of the members' losses and the penalty. Autograd differentiates
-        it; a head that knows its gradients may say them here.
+        The objective is the sum of the members' losses and the penalty. Autograd differentiates it;
+        a head with closed-form gradients may override this method.
 
         Args:
             raw: raw outputs ``(E, B, out)``, without a graph.
             target: ``(E, B, dim)``.
 
         Returns:
-            losses ``(E,)`` and the gradient by the raw outputs. Those by the head's own
-            parameters are in their ``grad``, instead of what was there.
+            losses ``(E,)`` and the gradient with respect to the raw outputs. The gradients of the
+            head's own parameters are in their ``grad``, replacing what was there.
         """
         for parameter in self.parameters():
             parameter.grad = None
@@ -88,24 +88,24 @@ class DeterministicHead(Head):
 class GaussianHead(Head):
     r"""Means and log-variances of independent normal distributions; trained by likelihood.
 
-    The first ``dim`` columns of the raw output are the mean, the others, :math:`v`, become the
-    logarithm of the variance between two learned bounds per column (arXiv 1805.12114,
-    appendix A.1):
+    The first ``dim`` columns of the raw output are the mean. The others, :math:`v`, become the
+    logarithm of the variance between two learned bounds per column (arXiv 1805.12114, appendix
+    A.1):
 
     .. math::
         \log \sigma^2 = \ell + \mathrm{softplus}(v' - \ell), \quad
         v' = h - \mathrm{softplus}(h - v).
 
-    Far from the data they keep the variance within what was seen; :meth:`penalty` draws them
+    Far from the data, the bounds keep the variance within what was seen; :meth:`penalty` draws them
     together. The upper bound is exceeded by less than :math:`e^{\ell - h}`.
 
-    The authors' training loss is twice the one here, without its constant: at the coefficient
-    0.01 that they write, theirs weighs what ``bound_penalty=0.005`` does here.
+    The authors' training loss is twice the one here, up to a constant: at their coefficient of
+    0.01, the penalty weighs as much as ``bound_penalty=0.005`` does here.
 
     Args:
         dim: columns of the target, n.
-        min_log_variance: the lower bounds at the start, normalised units.
-        max_log_variance: the upper bounds at the start.
+        min_log_variance: initial lower bounds, normalised units.
+        max_log_variance: initial upper bounds.
         bound_penalty: coefficient of the distance between the bounds.
 
     Raises:
@@ -159,8 +159,8 @@ class GaussianHead(Head):
     def variance(self, raw: Tensor) -> Tensor:
         r"""Predicted variance, ``(..., 2 dim)`` to ``(..., dim)``.
 
-        The exponential of :meth:`log_variance` without its logarithms, which are most of what
-        planning and fitting would spend here: :math:`e^\ell + e^h / (1 + e^{h - v})`.
+        The exponential of :meth:`log_variance` without its logarithms, which would take most of the
+        time in planning and fitting: :math:`e^\ell + e^h / (1 + e^{h - v})`.
         """
         share = torch.sigmoid(raw[..., self.dim :] - self.max_log_variance)
         return share * self.max_log_variance.exp() + self.min_log_variance.exp()
@@ -190,7 +190,7 @@ class GaussianHead(Head):
             \frac{\partial V}{\partial h} = s^2 e^h, \quad
             \frac{\partial V}{\partial \ell} = e^\ell.
 
-        Left to autograd, the dozen small operations of the loss take a tenth of a fit's time.
+        With autograd, the dozen small operations of the loss would take a tenth of a fit's time.
         """
         low, high = self.min_log_variance.detach(), self.max_log_variance.detach()
         share = torch.sigmoid(raw[..., self.dim :] - high)
@@ -222,7 +222,7 @@ class BernoulliHead(Head):
     """The raw output is the log-odds of an event; trained with the cross-entropy.
 
     Attributes:
-        weight: how many times the loss of an event counts, beside that of none, ``()``.
+        weight: factor on the loss of an event, relative to that of a non-event, ``()``.
     """
 
     weight: Tensor
@@ -243,13 +243,13 @@ class BernoulliHead(Head):
         return each.mean(-1)
 
     def standard_deviation(self, raw: Tensor) -> Tensor:
-        """Of an event that is one or zero."""
+        """Standard deviation of an event that is one or zero."""
         probability = raw.sigmoid()
         return (probability * (1 - probability)).sqrt()
 
 
 def _nats(squared: Tensor, variance: Tensor) -> Tensor:
-    """From squared errors in units of the variance."""
+    """Negative log-likelihood in nats, from squared errors in units of the variance."""
     return 0.5 * ((squared + variance.log()).mean(-1) + math.log(2 * math.pi))
 
 
@@ -261,7 +261,7 @@ def make_head(name: str, dim: int) -> Head:
         dim: columns of the target.
 
     Raises:
-        ValueError: for another name.
+        ValueError: for an unknown name.
 
     Examples:
         >>> make_head("gaussian", 3).out_features(3)

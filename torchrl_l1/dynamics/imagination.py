@@ -39,38 +39,38 @@ def imagine(
 ) -> TensorDict:
     """Roll a policy out in the ensemble, one random member per step for the whole batch.
 
-    A trajectory that leaves the box around the data ends there: the model knows nothing
-    outside, and rewards imagined there grow without bound. Entries that never varied in the data
-    stay as they are. Model and reward see the clipped
-    action; what is stored is the policy's sample, whose likelihood the policy gradient needs.
+    A trajectory that leaves the box around the data ends there: the model knows nothing outside,
+    and rewards imagined there grow without bound. Entries that never varied in the data stay as
+    they are. Model and reward see the clipped action; what is stored is the policy's sample, since
+    the policy gradient needs its likelihood.
 
-    The model is copied once, with its statistics folded into the weights; rewards and ends are
-    computed for all steps at once.
+    The model is copied once, with its statistics folded into the weights; rewards and terminations
+    are computed for all steps at once.
 
     Args:
-        dynamics: the model; one of its elites is drawn at each step (arXiv 1802.10592), and its
-            mean taken.
+        dynamics: the model; at each step one of its elites is drawn (arXiv 1802.10592), and its
+            mean is used.
         policy: maps observations ``(B, n)`` to sampled actions ``(B, m)``.
-        reward: maps observations, clipped actions and next observations, in rows, to one number
-            per row.
+        reward: maps rows of observations, clipped actions and next observations to one number per
+            row.
         start: first observations ``(B, n)``.
         horizon: number of steps, T.
         action_low: lower bounds ``(m,)``.
         action_high: upper bounds ``(m,)``.
-        terminated: whether the task ends in a next observation, ``(rows, n)`` to ``(rows,)``; by
-            default it never does.
+        terminated: whether the task ends in a next observation, ``(rows, n)`` to ``(rows,)``; never
+            by default.
         precision: of the hidden layers, see :class:`~torchrl_l1.planning.PlanningNetwork`.
 
     Returns:
-        trajectories of batch size ``[B, T]`` with ``observation``, ``action``, ``step``
-        ``(B, T, 1)``, ``valid`` ``(B, T, 1)`` (not ended before the step) and ``next``:
-        ``observation``, ``reward``, ``done``, ``left_box`` and ``terminated``. What follows a
-        step that is ``done`` is not valid and means nothing; its rewards are zero.
+        trajectories of batch size ``[B, T]`` with ``observation``, ``action``, ``step`` ``(B, T,
+        1)``, ``valid`` ``(B, T, 1)`` (not ended before the step) and ``next``: ``observation``,
+        ``reward``, ``done``, ``left_box`` and ``terminated``. Whatever follows a ``done`` step is
+        not valid and has no meaning; its rewards are zero.
 
     Raises:
-        ValueError: for no steps, start states of another shape, bounds that are empty or of
-            another width, a policy that does not give one action per row, a reward or termination
-            that is not one number per row, or a function that writes to what it is given.
+        ValueError: for no steps, start states of the wrong shape, bounds that are empty or of the
+            wrong width, a policy that does not give one action per row, a reward or termination
+            that is not one number per row, or a function that writes to its inputs.
     """
     n, m = dynamics.observation_dim, dynamics.action_dim
     check_count("horizon", horizon)
@@ -109,7 +109,7 @@ def imagine(
         observation = torch.clamp(predicted[t], box.low, box.high, out=observations[t + 1])
     inside = (predicted == observations[1:]).all(-1)  # NaN is not
     if not inside.all():
-        # A trajectory that left stays where it last was inside, with what it did there: outside,
+        # A trajectory that left stays in its last state inside, with its action there: outside,
         # neither state nor reward mean anything.
         last = inside.cumprod(0).sum(0)
         place = torch.arange(horizon + 1, device=device)[:, None].minimum(last)[..., None]
@@ -132,7 +132,7 @@ def imagine(
     valid = (ended.cumsum(0) - ended) == 0
     done = valid & ended.bool()
     left, fell = done & ~inside, done & inside
-    # Nothing is earned after the end: zero times what is no number would be none, too.
+    # Nothing is earned after the end; multiplying by zero would keep NaN.
     rewards = torch.where(valid, rewards, 0.0)
     done[-1] = True
     columns = {
@@ -157,23 +157,24 @@ def _forward_pass(
     member: int,
     memory: dict[tuple[torch.dtype, int], Tensor],
 ) -> ForwardPass:
-    """The pass of one member alone."""
+    """A forward pass of one member alone."""
     rows = [0] * network.members
     rows[member] = batch
     return ForwardPass(network, rows, memory=memory)
 
 
 class EnsembleWorldModel(TensorDictModuleBase):
-    """One imagined step as a TensorDictModule: next observation, reward, and whether it ends.
+    """One imagined step as a TensorDictModule: next observation, reward and ends.
 
     Args:
         dynamics: the ensemble.
         reward: maps observation, action and next observation to ``(...)``.
-        propagation: ``"mean"`` of the ensemble, or a ``"random_member"`` of its elites per call.
+        propagation: ``"mean"`` of the ensemble, or a ``"random_member"`` of its elites in each
+            call.
         terminated: maps next observations to whether the task ends there ``(...)``; never if
             ``None``.
-        box_exit: what leaving the box around the data is: ``"fail"``, worth nothing from
-            there on, or ``"truncate"``, cut off where the model ends.
+        box_exit: what leaving the box around the data does: ``"fail"`` terminates the episode,
+            which is worth nothing from then on; ``"truncate"`` truncates it where the model ends.
     """
 
     in_keys = ["observation", "action"]  # noqa: RUF012
@@ -197,7 +198,7 @@ class EnsembleWorldModel(TensorDictModuleBase):
         self.box_exit = box_exit
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Overwrite ``observation`` with the next one and write reward and ends."""
+        """Overwrite ``observation`` with the next one and write the reward and ends."""
         observation, action = tensordict["observation"], tensordict["action"]
         if self.propagation == "mean":
             change = self.dynamics.mean_change(observation, action)
@@ -232,25 +233,26 @@ class EnsembleWorldModel(TensorDictModuleBase):
 class EnsembleModelEnv(ModelBasedEnvBase):
     """A learned ensemble as an environment for TorchRL's rollouts, collectors and planners.
 
-    It ends where the state leaves the box around the model's data, in the last one inside, which
-    the reward of that step is of, and where the task does. Model and reward see the action within
-    its bounds. For the inner loop of an algorithm :func:`~torchrl_l1.dynamics.imagine` is faster;
-    it draws a member per step.
+    An episode ends where the task does, and where the state leaves the box around the model's data.
+    In the latter case it ends in its last state inside, for which that step's reward is computed.
+    Model and reward see the action within its bounds. For the inner loop of an algorithm
+    :func:`~torchrl_l1.dynamics.imagine` is faster; it draws a member per step.
 
     Args:
         dynamics: the ensemble.
         reward: maps observation, action and next observation to ``(...)``.
         start: draws initial observations, ``count -> (count, n)``.
-        action_low: lower bound of the actions, one number or one for each.
+        action_low: lower bound of the actions, a single number or one per entry.
         action_high: upper bound.
-        batch_size: environments side by side; ``()`` for planners, which bring their own.
-        propagation: see :class:`EnsembleWorldModel`, as for what follows.
+        batch_size: shape of the batch of environments; ``()`` for planners, which add their own.
+        propagation: see :class:`EnsembleWorldModel`, also for the next two.
         terminated: where the task ends.
-        box_exit: what leaving the box is.
+        box_exit: what leaving the box does.
 
     Raises:
-        ValueError: for bounds that are empty, not finite or of another width, or an unknown choice;
-            at a reset or step, for initial observations, rewards or terminations of another shape.
+        ValueError: for bounds that are empty, not finite or of the wrong width, or an unknown
+            choice; at a reset or step, for initial observations, rewards or terminations of the
+            wrong shape.
 
     Examples:
         >>> model = EnsembleDynamics(3, 1, members=2, hidden=(8,))
@@ -324,6 +326,6 @@ class EnsembleModelEnv(ModelBasedEnvBase):
         )
 
     def _set_seed(self, seed: int | None) -> None:
-        # All randomness is torch's global generator.
+        # All random numbers come from torch's global generator.
         if seed is not None:
             torch.manual_seed(seed)

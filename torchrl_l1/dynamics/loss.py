@@ -1,4 +1,4 @@
-"""What the fit of an ensemble minimises, as a loss module of TorchRL."""
+"""The objective in fitting an ensemble, as a loss module of TorchRL."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from torchrl_l1.dynamics.model import EnsembleDynamics
 class EnsembleDynamicsLoss(LossModule):
     """Loss of every member of an :class:`EnsembleDynamics` on its own batch of transitions.
 
-    The target is the normalised change of state; what is minimised per sample is the head's
-    business: the mean squared error for a :class:`DeterministicHead` (arXiv 2403.14860,
-    section 3.1), the negative log-likelihood for a :class:`GaussianHead` (arXiv 1805.12114). The
-    members' losses are summed, so that each member's gradient is what it would be alone; the
-    head's penalty joins the sum once.
+    The target is the normalised change of state. The head determines the loss per sample: the mean
+    squared error for a :class:`DeterministicHead` (arXiv 2403.14860, section 3.1), the negative
+    log-likelihood for a :class:`GaussianHead` (arXiv 1805.12114). The members' losses are summed,
+    so each member's gradient is what it would be alone; the head's penalty is added to the sum
+    once.
 
     Args:
         dynamics: the model to be trained.
 
     Input keys (see :meth:`set_keys`): ``observation``, ``action`` and ``next_observation`` with
-    batch size ``[B]`` (all members see the same batch) or ``[E, B]`` (a batch per member).
-    Output: ``loss_dynamics`` (scalar), to be minimised, and ``member_loss`` ``(E,)``, detached and
-    without the penalty, so that it compares members and fits.
+    batch size ``[B]`` (all members see the same batch) or ``[E, B]`` (a batch per member). Output:
+    ``loss_dynamics`` (scalar), to be minimised, and ``member_loss`` ``(E,)``, detached and without
+    the penalty, for comparing members and fits.
 
     Raises:
         KeyError: if an input key is missing.
-        ValueError: for observations of different shapes, another batch size, or numbers of another
-            type than the model's.
+        ValueError: for observations of different shapes, an invalid batch size, or numbers of
+            another type than the model's.
 
     Examples:
         >>> import torch
@@ -91,8 +91,8 @@ class EnsembleDynamicsLoss(LossModule):
         members, batch = model.members, tuple(observation.shape[:-1])
         if not (len(batch) == 1 or (len(batch) == 2 and batch[0] == members)):
             raise ValueError(
-                f"EnsembleDynamicsLoss: data of batch size {batch} must be of [B] for all members, "
-                f"or of [{members}, B] for each its own: reshape them with reshape(-1)"
+                f"EnsembleDynamicsLoss: data have batch size {batch}, expected [B] for all "
+                f"members or [{members}, B] with a batch for each: reshape them with reshape(-1)"
             )
         expected = model.change_normalizer.mean.dtype
         for key, value in zip(self.in_keys, (observation, action, next_observation), strict=True):
@@ -117,7 +117,7 @@ def evaluate_members(
     """Mean loss of every member on the same data ``[N]``: ``(E,)``.
 
     Raises:
-        ValueError: if there are none.
+        ValueError: if there are no data.
     """
     if data.shape[0] == 0:
         raise ValueError("evaluate_members: there are no data")

@@ -23,7 +23,7 @@ from torchrl_l1.dynamics.storage import load_dynamics, save_dynamics, stored_as
 class EnsembleDynamics(nn.Module):
     r"""Ensemble model of the change of state, :math:`x_{t+1} - x_t = \hat f(x_t, u_t)`.
 
-    Inputs and targets are normalised; all public methods speak raw units. The ensemble's mean
+    Inputs and targets are normalised; all public methods use raw units. The ensemble's mean
     is the :math:`\hat f_\theta` on which the L1 controller is built (arXiv 2403.14860,
     section 3.2), and :meth:`value_and_jacobian` gives it together with its derivative with
     respect to the action in one pass.
@@ -36,18 +36,18 @@ class EnsembleDynamics(nn.Module):
         activation: ``"relu"``, ``"tanh"`` or ``"silu"``.
         std_floor: smallest standard deviation of the normalisers, in raw units.
         box_margin: widening of the box around the data, see :class:`DataBox`.
-        head: meaning of a member's raw output and its loss; a :class:`DeterministicHead` if
+        head: interpretation of a member's raw output, and its loss; a :class:`DeterministicHead` if
             ``None``.
 
     Attributes:
-        elites: indices of the members that the ensemble's mean is over, ascending, ``(k,)``; all
-            of them until :meth:`set_elites`.
-        affine_in_action: whether members give the coefficients of a function that is affine in
-            the action, which their networks then do not read: a :class:`ControlAffineDynamics`.
-            Planning networks and fits go by it.
+        elites: indices of the members over which the ensemble's mean is taken, ascending, ``(k,)``;
+            all members until :meth:`set_elites` is called.
+        affine_in_action: whether members give the coefficients of a function that is affine in the
+            action, which their networks then do not read, as in a :class:`ControlAffineDynamics`.
+            Planning networks and fits rely on it.
         residuals: covariance of the one-step residuals, measured at each fit.
-        quality: how good :func:`~torchrl_l1.dynamics.fit_dynamics` found the model; ``None`` for
-            others.
+        quality: the quality that :func:`~torchrl_l1.dynamics.fit_dynamics` measured; ``None`` for
+            other models.
 
     Examples:
         >>> import torch
@@ -95,36 +95,36 @@ class EnsembleDynamics(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the model is."""
+        """Device of the model."""
         return self.change_normalizer.mean.device
 
     def set_elites(self, index: Sequence[int] | Tensor) -> None:
-        """Say which members count in the ensemble's mean, and are drawn where one is drawn.
+        """Choose the members over which the ensemble's mean is taken and from which one is drawn.
 
         Args:
             index: indices of the members, in any order.
 
         Raises:
-            ValueError: if there is none, or one occurs twice or does not exist, or for a mask.
+            ValueError: if there are none, or one occurs twice or does not exist, or for a mask.
         """
         kind = torch.as_tensor(index).dtype
         if len(index) and (kind == torch.bool or kind.is_floating_point):
             raise ValueError(f"elites must be indices of members, got numbers of {kind}")
         chosen = sorted(int(member) for member in index)
         if not chosen or len(set(chosen)) < len(chosen):
-            raise ValueError(f"elites must be one member or more, each once, got {chosen}")
+            raise ValueError(f"elites must be one or more members, each once, got {chosen}")
         if chosen[0] < 0 or chosen[-1] >= self.members:
             raise ValueError(f"elites must be in 0 to {self.members - 1}, got {chosen}")
         if len(chosen) == len(self.elites):
-            self.elites.copy_(torch.tensor(chosen))  # where other processes see it, too
+            self.elites.copy_(torch.tensor(chosen))  # in place, so that other processes see it too
         else:
             self.elites = torch.tensor(chosen, device=self.elites.device)
 
     def fit_statistics(self, observation: Tensor, action: Tensor, change: Tensor) -> None:
         """Set the normalisers and the data box from samples ``(N, n)``, ``(N, m)``, ``(N, n)``.
 
-        Inputs that never vary in them are ignored, whatever they are later: nothing can be learned
-        of what they do, and their weights stay as they were drawn.
+        Inputs that never vary in them are ignored, whatever values they take later: nothing can be
+        learned about their effect, and their weights keep their initial values.
         """
         self.observation_normalizer.fit(observation)
         self.action_normalizer.fit(action)
@@ -149,10 +149,10 @@ class EnsembleDynamics(nn.Module):
         )
 
     def raw(self, inputs: Tensor) -> Tensor:
-        """What the head makes sense of, for all members, from :meth:`normalize_inputs`.
+        """The head's input for all members, from :meth:`normalize_inputs`.
 
         Args:
-            inputs: shared by the members ``(B, n + m)``, or their own ``(E, B, n + m)``.
+            inputs: shared by the members ``(B, n + m)``, or one batch per member ``(E, B, n + m)``.
 
         Returns:
             ``(E, B, out)``, normalised units.
@@ -165,11 +165,11 @@ class EnsembleDynamics(nn.Module):
         return self.raw_from_output(output, inputs)
 
     def network_inputs(self, inputs: Tensor) -> Tensor:
-        """What of :meth:`normalize_inputs` the network reads: all of it."""
+        """The part of :meth:`normalize_inputs` that the network reads: all of it."""
         return inputs
 
     def raw_from_output(self, output: Tensor, inputs: Tensor) -> Tensor:
-        """What the head makes sense of, from the network's output: the same."""
+        """The head's input, from the network's output: the same."""
         return output
 
     def member_changes(self, observation: Tensor, action: Tensor) -> Tensor:
@@ -180,7 +180,7 @@ class EnsembleDynamics(nn.Module):
         return changes.reshape(self.members, *observation.shape)
 
     def member_distribution(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """What every member predicts, elite or not, as independent normal distributions.
+        """The prediction of every member, elite or not, as independent normal distributions.
 
         Args:
             observation: ``(..., n)``, raw units.
@@ -212,9 +212,8 @@ class EnsembleDynamics(nn.Module):
     def value_and_jacobian(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         r"""Mean predicted change and its derivative with respect to the action, in raw units.
 
-        The chain rule through the normalisers is :math:`J = D_{\Delta x} J' D_{u}^{-1}` with
-        the floored standard deviations (arXiv 2403.14860, appendix, technical remarks
-        on METRPO).
+        The chain rule through the normalisers is :math:`J = D_{\Delta x} J' D_{u}^{-1}` with the
+        floored standard deviations (arXiv 2403.14860, appendix, technical remarks on METRPO).
 
         Returns:
             change ``(..., n)`` and Jacobian ``(..., n, m)``.
@@ -229,7 +228,7 @@ class EnsembleDynamics(nn.Module):
     def _in_raw_units(
         self, value: Tensor, tangent: Tensor, shape: torch.Size
     ) -> tuple[Tensor, Tensor]:
-        """Mean change and Jacobian of the elites, of ``(E, B, out)`` and ``(E, B, m, out)``."""
+        """Mean change and Jacobian of the elites, from ``(E, B, out)`` and ``(E, B, m, out)``."""
         n, m = self.observation_dim, self.action_dim
         mean, std = self.change_normalizer.mean, self.change_normalizer.std
         change = self._over_elites(value)[:, :n] * std + mean
@@ -238,7 +237,7 @@ class EnsembleDynamics(nn.Module):
         return change.reshape(shape), (jacobian * scale).reshape(*shape, m)
 
     def taylor_remainder(self, observation: Tensor, u_bar: Tensor, action: Tensor) -> Tensor:
-        r"""What the tangent in the action at ``u_bar`` misses of the mean change at ``action``.
+        r"""Error of the tangent in the action at ``u_bar`` for the mean change at ``action``.
 
         Args:
             observation: ``(..., n)``, raw units.
@@ -264,18 +263,18 @@ class EnsembleDynamics(nn.Module):
     ) -> tuple[Tensor, Callable[[Tensor], tuple[Tensor, Tensor]]]:
         """The mean change expanded in the action, at ``u_bar`` or at another action.
 
-        All that the switching law and the affinization need, from one pass through the network.
+        One pass through the network gives all that the switching law and the affinization need.
 
         Args:
             observation: ``(..., n)``, raw units.
             u_bar: where the model is expanded ``(..., m)``.
-            candidate: where it is expanded instead, should the expansion at ``u_bar`` fail.
+            candidate: where it is expanded instead if the expansion at ``u_bar`` fails.
             tested: where the expansion at ``u_bar`` is compared with the model ``(..., m)``.
 
         Returns:
-            :meth:`taylor_remainder` of ``u_bar`` and ``tested``, and a function of a mask
-            ``(..., 1)``, true where the candidate is selected, which returns
-            :meth:`value_and_jacobian` there. Both are equal to the methods' but for rounding.
+            :meth:`taylor_remainder` of ``u_bar`` and ``tested``, and a function of a mask ``(...,
+            1)``, true where the candidate is selected, which returns :meth:`value_and_jacobian`
+            there. Both equal the methods' results up to rounding.
         """
         n, m = self.observation_dim, self.action_dim
         actions = torch.stack([u_bar, candidate, tested])
@@ -296,16 +295,16 @@ class EnsembleDynamics(nn.Module):
         Args:
             observation: ``(..., n)``, raw units.
             action: ``(..., m)``, raw units.
-            source: ``"residuals"``, those of the fit's validation data; ``"heads"``, the elites'
-                mean predicted variance; ``"disagreement"``, the covariance of their means; or
-                ``"sum"``, all three. The middle two, which may be singular, get a hundredth of
-                the first.
+            source: ``"residuals"``, the covariance on the fit's validation data; ``"heads"``, the
+                elites' mean predicted variance; ``"disagreement"``, the covariance of their means;
+                or ``"sum"``, all three. The middle two, which may be singular, get a hundredth of
+                the first added.
 
         Returns:
             ``(n, n)`` for ``"residuals"``, else ``(..., n, n)``; state units squared.
 
         Raises:
-            ValueError: for another source.
+            ValueError: for an unknown source.
         """
         check_choice("source", source, ("residuals", "heads", "disagreement", "sum"))
         measured = self.residuals.covariance
@@ -324,7 +323,7 @@ class EnsembleDynamics(nn.Module):
     def residual_statistics(
         self, observation: Tensor, action: Tensor, source: str = "residuals"
     ) -> ResidualStatistics:
-        """:meth:`residual_covariance`, as the L1 controller takes it."""
+        """:meth:`residual_covariance` in the form that the L1 controller takes."""
         return ResidualStatistics(
             self.residual_covariance(observation, action, source),
             self.residuals.inflation,
@@ -334,14 +333,14 @@ class EnsembleDynamics(nn.Module):
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write weights, normalisers, head, elites, residual statistics and quality to one file.
 
-        The format is that of safetensors: tensors, and settings as JSON; nothing in it is run
-        when it is read. The file is there whole or not at all.
+        The format is that of safetensors: tensors, and settings as JSON; reading it executes
+        nothing. The file is written completely or not at all.
 
         Args:
-            path: of the file, such as ``"model.safetensors"``; what is there is replaced.
+            path: path of the file, such as ``"model.safetensors"``; an existing file is replaced.
 
         Raises:
-            TypeError: for a class of model or head of one's own.
+            TypeError: for a user-defined class of model or head.
 
         Examples:
             >>> from tempfile import mkdtemp
@@ -359,11 +358,11 @@ class EnsembleDynamics(nn.Module):
         """Read a model that :meth:`save` wrote, in evaluation mode.
 
         Args:
-            path: of the file.
-            device: where the model is to be.
+            path: path of the file.
+            device: device for the model.
 
         Returns:
-            the model, of the class that was saved; its predictions are equal bit for bit.
+            the model, of the class that was saved; its predictions are identical bit for bit.
 
         Raises:
             FileNotFoundError: if there is no such file.
@@ -371,7 +370,7 @@ class EnsembleDynamics(nn.Module):
         """
         loaded = load_dynamics(path, device)
         if not isinstance(loaded, cls):
-            raise ValueError(f"{path} holds a {type(loaded).__name__}, no {cls.__name__}")
+            raise ValueError(f"{path} holds a {type(loaded).__name__}, not a {cls.__name__}")
         return loaded
 
     def _over_elites(self, per_member: Tensor) -> Tensor:
@@ -384,7 +383,7 @@ class EnsembleDynamics(nn.Module):
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
-        # The number of elites is not that of the module, and older checkpoints have none.
+        # The number of elites may differ from this module's, and older checkpoints have none.
         stored = state_dict.setdefault(prefix + "elites", torch.arange(self.members))
         if stored.shape != self.elites.shape:
             self.elites = self.elites.new_empty(stored.shape)

@@ -1,4 +1,4 @@
-"""A frozen copy of an ensemble in the precision that is fastest, to plan and to imagine with."""
+"""A frozen copy of an ensemble in the fastest precision, for planning and imagination."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from torchrl_l1.dynamics.training_step import Members
 
 Precision = Literal["auto", "float32", "bfloat16"]
 
-# Narrower products cost more to convert and to call than they save.
+# For narrower layers, conversion and calls cost more than the products save.
 _LEAST_WIDTH = 192
 
-# Methods that make predictions of weights and statistics.
+# Methods that turn weights and statistics into predictions.
 _PREDICTIONS = (
     "normalize_inputs",
     "network_inputs",
@@ -49,16 +49,16 @@ def resolve_precision(
     width: int = _LEAST_WIDTH,
     name: str = "precision",
 ) -> Literal["float32", "bfloat16"]:
-    """``"auto"`` becomes ``"bfloat16"`` for wide layers on processors that multiply it faster.
+    """Resolve ``"auto"`` to ``"bfloat16"`` for wide layers on processors that multiply it faster.
 
-    Those with AMX do, by far. Of those with AVX-512 alone, some multiply it at twice the rate of
-    float32 and some at half of it, so that two small products are timed once per process.
+    Processors with AMX do, by far. Of those with AVX-512 alone, some multiply it at twice the rate
+    of float32 and some at half, so two small products are timed once per process.
 
     Args:
-        precision: ``"auto"``, or what is to be returned.
-        device: where the products are computed.
-        width: of the narrowest hidden layer.
-        name: of the setting, for the error.
+        precision: ``"auto"``, or the value to return.
+        device: device that computes the products.
+        width: width of the narrowest hidden layer.
+        name: name of the setting, for the error.
 
     Raises:
         ValueError: for an unknown precision.
@@ -71,7 +71,7 @@ def resolve_precision(
         raise ValueError(f"{name} must be 'auto', 'float32' or 'bfloat16', got {precision!r}")
     if torch.device(device).type != "cpu" or width < _LEAST_WIDTH:
         return "float32"
-    # Only recent versions of torch tell.
+    # Only recent versions of torch report them.
     tell: Callable[[], dict[str, Any]] = getattr(torch.cpu, "get_capabilities", dict)
     capabilities = tell()
     faster = capabilities.get("amx_bf16") or (
@@ -94,7 +94,7 @@ def _multiplies_bfloat16_faster() -> bool:
 
 
 def model_precision(model: Members, precision: str) -> Literal["float32", "bfloat16"]:
-    """What ``precision`` becomes for a model, see :func:`resolve_precision`."""
+    """The precision that a model's ``precision`` stands for, see :func:`resolve_precision`."""
     widths = [weight.shape[2] for weight in model.network.weights[:-1]]
     return resolve_precision(precision, model.device, min(widths, default=0))
 
@@ -103,23 +103,23 @@ def model_precision(model: Members, precision: str) -> Literal["float32", "bfloa
 class PlanningNetwork:
     """Weights of an ensemble's elites, copied once per plan or imagination.
 
-    The products of hidden units, nearly all of the work, run in the precision asked for; input
+    The products of hidden units, nearly all of the work, run in the requested precision; input
     layer, statistics and states stay float32. The statistics of the inputs are folded into the
-    weights. Each hidden layer has one more unit, which is always one: its weights are the biases
-    of the next layer. More units, always zero, fill the widths up to what processors like.
-    Members are numbered by their place among the elites.
+    weights. Each hidden layer has one more unit, which is always one: its weights are the biases of
+    the next layer. Further units, always zero, pad the widths to what suits processors. Members are
+    numbered by their position among the elites.
 
     Attributes:
-        weights: per layer ``(k, in, out)``, widths filled up.
-        bias: of the first layer ``(k, out)``.
+        weights: per layer ``(k, in, out)``, with padded widths.
+        bias: bias of the first layer ``(k, out)``.
         observation_dim: number of observations, n.
         action_dim: number of actions, m.
-        change_mean: of the change of state ``(n,)``, raw units.
-        change_std: likewise.
+        change_mean: mean of the change of state ``(n,)``, raw units.
+        change_std: its standard deviation, likewise.
         activation: activation of the hidden layers, in place.
         standard_deviation: maps a member's raw output to the standard deviation of its
             prediction, normalised units; ``None`` if it predicts points.
-        affine_in_action: as of the ensemble.
+        affine_in_action: as in the ensemble.
 
     Examples:
         >>> model = EnsembleDynamics(3, 1, members=2, hidden=(8, 8))
@@ -148,7 +148,7 @@ class PlanningNetwork:
         """Copy the elites of an ensemble.
 
         Raises:
-            TypeError: for a class of one's own that predicts in another way.
+            TypeError: for a user-defined class that predicts in another way.
             ValueError: for an unknown precision.
         """
         _check_predicts_as_its_weights(type(dynamics))
@@ -161,7 +161,8 @@ class PlanningNetwork:
         activation = ACTIVATIONS[dynamics.network.activation]
         _fold_biases(weights, biases, activation.one)
         # Between the layers of hidden units, and from the last to an output that is a small
-        # correction of the state. That of a control-affine model may be a difference of large ones.
+        # correction of the state. That of a control-affine model may be a difference of large
+        # numbers.
         last = len(weights) - 1
         end = last if dynamics.affine_in_action else last + 1
         low = range(1, end) if last > 1 else range(0)
@@ -187,21 +188,21 @@ class PlanningNetwork:
         return self.weights[0].shape[0]
 
     def raw(self, inputs: Tensor, member: int) -> Tensor:
-        """A member's raw output from observations and actions ``(B, n + m)``: ``(B, out)``."""
+        """One member's raw output from observations and actions ``(B, n + m)``: ``(B, out)``."""
         rows = [0] * self.members
         rows[member] = inputs.shape[0]
         return ForwardPass(self, rows)(inputs)
 
     def change(self, inputs: Tensor, member: int) -> Tensor:
-        """A member's mean prediction, normalised: ``(B, n + m)`` to ``(B, n)``."""
+        """One member's mean prediction, normalised: ``(B, n + m)`` to ``(B, n)``."""
         return self.raw(inputs, member)[:, : self.observation_dim]
 
     def sample(self, raw: Tensor, noise: Tensor | None) -> Tensor:
-        """A draw from the predictions that raw outputs stand for: ``(B, out)`` to ``(B, n)``.
+        """Draw from the predictions that raw outputs represent: ``(B, out)`` to ``(B, n)``.
 
         Args:
             raw: raw outputs.
-            noise: standard normal numbers ``(B, n)``; not needed by members that predict points.
+            noise: standard normal numbers ``(B, n)``; members that predict points need none.
         """
         mean = raw[:, : self.observation_dim]
         if self.standard_deviation is None or noise is None:
@@ -210,17 +211,17 @@ class PlanningNetwork:
 
 
 class ForwardPass:
-    """Raw outputs of a network for rows that are sorted by member, again and again.
+    """Repeated evaluation of a network's raw outputs for rows that are sorted by member.
 
-    Member by member through all layers, so that its hidden units stay in the cache. They are in
-    the same memory each time (fresh tensors would soon have been everywhere in that cache), and
-    what does not depend on the inputs is prepared once.
+    It goes member by member through all layers, so that the hidden units stay in the cache. They
+    use the same memory each time (new tensors would soon fill that cache), and what does not depend
+    on the inputs is prepared once.
 
     Args:
         network: the network.
-        rows: number of rows of each member, in turn.
-        shared: whether the members read the same rows, all of the input, instead of their own.
-        memory: where to keep hidden units; passes that are not used at once may share it.
+        rows: number of rows per member, in order.
+        shared: whether all members read the same rows, the whole input, instead of their own.
+        memory: where to keep hidden units; passes that are not used at the same time may share it.
     """
 
     def __init__(
@@ -234,7 +235,7 @@ class ForwardPass:
         self._network, self._copies = network, len(rows) if shared else 1
         self._width = network.weights[0].shape[1]
         last = network.weights[-1]
-        # Column by column in memory: it is columns that are worked on from here.
+        # Column by column in memory, since the operations from here on work on columns.
         self._out = last.new_empty(last.shape[2], sum(rows)).t()
         self._members: list[tuple[int, int, Tensor, list[_Layer]]] = []
         for member, end in enumerate(accumulate(rows)):
@@ -275,7 +276,7 @@ def _layers(
     out: Tensor,
     memory: dict[tuple[torch.dtype, int], Tensor],
 ) -> list[_Layer]:
-    """Units read, the same in the precision of the weight, the weight, and where to write."""
+    """The units read, the same in the weight's precision, the weight, and where to write."""
     layers: list[_Layer] = []
     units = out  # the first layer reads inputs that are not known yet
     for layer, weights in enumerate(network.weights):
@@ -292,7 +293,7 @@ def _layers(
 def _part(
     memory: dict[tuple[torch.dtype, int], Tensor], like: Tensor, shape: Sequence[int], slot: int
 ) -> Tensor:
-    """Uninitialised tensor in a slot of the memory, which grows where it must."""
+    """Uninitialised tensor in a slot of the memory, which grows as needed."""
     size = prod(shape)
     found = memory.get((like.dtype, slot))
     if found is None or found.numel() < size:
@@ -301,20 +302,20 @@ def _part(
 
 
 def _check_predicts_as_its_weights(kind: type[Any]) -> None:
-    """Refuse a class whose predictions a copy of weights and statistics does not know."""
+    """Reject a class whose predictions cannot be made from a copy of weights and statistics."""
     own = ControlAffineDynamics if issubclass(kind, ControlAffineDynamics) else EnsembleDynamics
-    if not issubclass(kind, own):  # what torch.compile makes of one passes all on to it
+    if not issubclass(kind, own):  # the wrapper that torch.compile makes passes everything on
         return
     for name in _PREDICTIONS:
         if getattr(kind, name) is not getattr(own, name):
             raise TypeError(
-                f"{kind.__name__} has a {name} of its own, which planning and imagination, that "
-                f"copy the weights of an {own.__name__}, would pass over: use EnsembleModelEnv"
+                f"{kind.__name__} has a {name} of its own, which planning and imagination would "
+                f"ignore, since they copy the weights of an {own.__name__}: use EnsembleModelEnv"
             )
 
 
 def _fold_inputs(dynamics: EnsembleDynamics, weights: list[Tensor], biases: list[Tensor]) -> None:
-    """Change the weights, in place, to those that take observation and action in raw units."""
+    """Change the weights, in place, to take observation and action in raw units."""
     action = dynamics.action_normalizer
     parts = (dynamics.observation_normalizer, action)
     mean = torch.cat([part.mean for part in parts]).double()
@@ -334,7 +335,7 @@ def _fold_inputs(dynamics: EnsembleDynamics, weights: list[Tensor], biases: list
 def _fold_biases(weights: list[Tensor], biases: list[Tensor], one: float) -> None:
     """Change the weights, in place, to those of layers with a unit that is always one.
 
-    ``one`` is what the activation maps to one. The first layer's bias remains.
+    ``one`` is an input that the activation maps to one. The first layer's bias remains.
     """
     last = len(weights) - 1
     for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):

@@ -11,11 +11,11 @@ from torchrl_l1.checks import check_not_negative, check_positive
 class Normalizer(nn.Module):
     """Shift and scale that give the data it was fitted to zero mean and unit variance.
 
-    Statistics are accumulated in float64 and stored in the module's dtype. The standard
-    deviation never falls below ``std_floor``: a state that hardly moves would otherwise turn
-    rounding errors into large normalised values, and its reciprocal into a large Jacobian.
-    Whoever differentiates through the normaliser must use :attr:`std` as it stands here
-    (arXiv 2403.14860, appendix, technical remarks on METRPO), floor included.
+    Statistics are accumulated in float64 and stored in the module's dtype. The standard deviation
+    never falls below ``std_floor``: a state that hardly moves would otherwise turn rounding errors
+    into large normalised values, and its reciprocal into a large Jacobian. Code that differentiates
+    through the normaliser must use :attr:`std` as it is, floor included (arXiv 2403.14860,
+    appendix, technical remarks on METRPO).
 
     Args:
         dim: width of the vectors.
@@ -44,7 +44,7 @@ class Normalizer(nn.Module):
         """Set mean and standard deviation from ``data`` of shape ``(..., dim)``.
 
         Raises:
-            ValueError: if ``data`` is empty, not finite or of another width.
+            ValueError: if ``data`` is empty, not finite or of the wrong width.
         """
         if data.shape[-1] != self.mean.shape[-1]:
             raise ValueError(
@@ -62,10 +62,10 @@ class Normalizer(nn.Module):
 
     @torch.no_grad()
     def ignore(self, columns: Tensor) -> None:
-        """Normalise what is in some columns to zero, until the next fit.
+        """Normalise some columns to zero until the next fit.
 
         Args:
-            columns: which, ``(dim,)`` bool. Their standard deviation becomes infinite.
+            columns: the columns, ``(dim,)`` bool. Their standard deviation becomes infinite.
         """
         self.std.masked_fill_(columns, torch.inf)
 
@@ -81,7 +81,7 @@ class Normalizer(nn.Module):
 class DataBox(nn.Module):
     """Axis-aligned box around the observations seen so far, widened by a margin.
 
-    It stands for the compact state set of the paper's MDP: outside of it the model is a guess,
+    It represents the compact state set of the paper's MDP: outside it, the model can only guess,
     and an episode that leaves it has failed (arXiv 2403.14860, section 2.1).
 
     Args:
@@ -110,14 +110,14 @@ class DataBox(nn.Module):
 
     @property
     def fixed(self) -> Tensor:
-        """Which entries never varied in the data, ``(dim,)`` bool."""
+        """Entries that never varied in the data, ``(dim,)`` bool."""
         return self.low == self.high
 
     def hold(self, before: Tensor, after: Tensor) -> Tensor:
-        """A prediction ``(..., dim)`` with the entries that never varied as they were before it.
+        """A prediction ``(..., dim)`` with entries that never varied kept at their previous values.
 
-        A model that never saw them change knows nothing of it, and the box has no room for its
-        errors there. What is not finite stays so.
+        A model that never saw them change knows nothing about them, and the box has no room for its
+        errors there. Non-finite values stay non-finite.
         """
         return torch.where(self.fixed & after.isfinite(), before, after)
 

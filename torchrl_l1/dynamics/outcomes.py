@@ -21,23 +21,23 @@ from torchrl_l1.dynamics.fit import (
 from torchrl_l1.dynamics.heads import BernoulliHead, DeterministicHead, Head
 from torchrl_l1.dynamics.normalizer import DataBox, Normalizer
 
-# Rows that go through the network together: their hidden units stay in a processor's cache.
+# Rows that pass through the network together: their hidden units stay in a CPU's cache.
 _CPU_BLOCK = 2048
 _OTHER_BLOCK = 262_144
 
-# Rows of the validation data whose losses are computed together.
+# Validation rows whose losses are computed together.
 _CHUNK = 20_000
 
-# How much more an error on the rarer kind of transition may count in a fit.
+# Largest factor on an error for the rarer kind of transition in a fit.
 _MOST_WEIGHT = 1e3
 
 
 class OutcomeModel(nn.Module):
-    """Perceptrons that give one number for a row of numbers, and the normaliser before them.
+    """Perceptrons that map a row of numbers to one number, with a normaliser in front.
 
     Args:
         in_features: width of a row.
-        head: meaning of the number, and its loss.
+        head: interpretation of the number, and its loss.
         members: number of networks, E.
         hidden: widths of the hidden layers.
         activation: ``"relu"``, ``"tanh"`` or ``"silu"``.
@@ -62,15 +62,15 @@ class OutcomeModel(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the model is."""
+        """Device of the model."""
         return self.input_normalizer.mean.device
 
     def network_inputs(self, inputs: Tensor) -> Tensor:
-        """What of the normalised rows the network reads: all of it."""
+        """The part of the normalised rows that the network reads: all of it."""
         return inputs
 
     def raw_from_output(self, output: Tensor, inputs: Tensor) -> Tensor:
-        """What the head makes sense of, from the network's output: the same."""
+        """The head's input, from the network's output: the same."""
         return output
 
     def member_mean(self, rows: Tensor) -> Tensor:
@@ -88,18 +88,18 @@ class RewardModel(OutcomeModel):
     """A learned reward of observation, action and next observation.
 
     The networks see the observation, the action and the change of the observation, each entry
-    normalised by itself. The reward is the mean over the members, and no further beyond those of
-    the data than ``margin`` allows: outside, a regression knows nothing, and a policy would find
-    where it promises most.
+    normalised on its own. The reward is the mean over the members, limited to the range of the
+    data's rewards widened by ``margin``: outside, a regression knows nothing, and a policy would
+    exploit its errors.
 
     Args:
         observation_dim: number of observations, n.
         action_dim: number of actions, m.
         members: number of networks.
-        hidden: widths of their hidden layers.
+        hidden: widths of the hidden layers.
         activation: ``"relu"``, ``"tanh"`` or ``"silu"``.
         std_floor: smallest standard deviation of the normalisers, raw units.
-        margin: how far a reward may lie beyond those of the data, as a fraction of their range.
+        margin: how far a reward may exceed the range of the data's, as a fraction of that range.
 
     Examples:
         >>> model = RewardModel(3, 1, hidden=(16,))
@@ -125,7 +125,7 @@ class RewardModel(OutcomeModel):
 
     @staticmethod
     def rows(observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
-        """What the model reads of transitions ``(..., n)``, ``(..., m)`` and ``(..., n)``."""
+        """The model's input from transitions ``(..., n)``, ``(..., m)`` and ``(..., n)``."""
         return torch.cat([observation, action, next_observation - observation], -1)
 
     def forward(self, observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
@@ -138,20 +138,20 @@ class RewardModel(OutcomeModel):
 class TerminationModel(OutcomeModel):
     """A learned termination: whether an episode is over in a next observation.
 
-    Terminal states are rare. In a fit, errors on them count as much more as there are fewer of
-    them, and afterwards the threshold is put where as many of the training data's states lie
-    above it as are terminal: imagination then ends episodes as often as the data do, however
-    sharp the networks are by then. Where no terminal state has been seen, none is predicted.
+    Terminal states are rare, so a fit gives errors on them proportionally more weight. Then the
+    threshold is set so that as many of the training data's states lie above it as are terminal:
+    imagination then ends episodes as often as the data do, however sharp the networks are by then.
+    If no terminal state has been seen, none is predicted.
 
     Args:
         observation_dim: number of observations, n.
         members: number of networks.
-        hidden: widths of their hidden layers.
+        hidden: widths of the hidden layers.
         activation: ``"relu"``, ``"tanh"`` or ``"silu"``.
         std_floor: smallest standard deviation of the normaliser, raw units.
 
     Attributes:
-        threshold: log-odds above which a state is terminal, ``()``; infinite before one is seen.
+        threshold: log-odds above which a state is terminal, ``()``; infinite until one is seen.
 
     Examples:
         >>> model = TerminationModel(3, hidden=(16,))
@@ -185,8 +185,8 @@ class RewardReport:
 
     Attributes:
         fit: losses and steps, normalised units.
-        explained_variance: share of the variance of the validation data's rewards that the
-            model's prediction explains: one less the mean squared error over that variance.
+        explained_variance: share of the variance of the validation data's rewards that the model
+            explains: one minus the mean squared error divided by that variance.
     """
 
     fit: FitReport
@@ -198,11 +198,11 @@ class TerminationReport:
     """Outcome of a fit of a :class:`TerminationModel`.
 
     Attributes:
-        fit: losses, the rarer kind weighted, and steps; zeros where there is nothing to learn.
+        fit: losses, with the rarer kind weighted, and steps; zeros if there is nothing to learn.
         terminal: share of the training transitions that end an episode.
-        missed: share of the validation data's terminal states that the model does not call so;
-            zero if there are none.
-        false_alarms: share of its other states that the model calls terminal.
+        missed: share of the validation data's terminal states that the model fails to predict; zero
+            if there are none.
+        false_alarms: share of the other states that the model predicts to be terminal.
     """
 
     fit: FitReport
@@ -219,20 +219,20 @@ def fit_reward(
     optimizer: torch.optim.Optimizer,
     action_key: NestedKey = "action",
 ) -> RewardReport:
-    """Fit a model to the rewards of transitions, from the weights that it has.
+    """Fit a model to the rewards of transitions, starting from its current weights.
 
     Args:
-        model: changed in place.
+        model: the model, changed in place.
         train: transitions ``[N]`` with ``observation``, an action, ``("next", "observation")`` and
             ``("next", "reward")``.
-        validation: others, which say when to stop.
-        config: as of the dynamics; shares of the data and elites do not matter.
+        validation: other transitions, which decide when to stop.
+        config: as for the dynamics; shares of the data and elites are not used.
         optimizer: over the model's parameters.
-        action_key: of the action that earned the reward.
+        action_key: key of the action that earned the reward.
 
     Raises:
         ValueError: if there is nothing to train or to validate on, for decay of other layers, or an
-            optimizer of another model. The model is as it was then.
+            optimizer of another model. The model is then unchanged.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -254,7 +254,7 @@ def fit_reward(
     fit = _fit(model, rows, targets, config, optimizer)
     with torch.no_grad():
         error = normalizer.denormalize(model.member_mean(rows[1])[:, None]) - rewards[1]
-    # Rewards that never change have no variance to explain.
+    # Constant rewards have no variance to explain.
     floor = normalizer.std_floor**2
     spread = max(rewards[1].var(correction=0).item(), floor)
     return RewardReport(fit, 1 - error.square().mean().item() / spread)
@@ -267,16 +267,17 @@ def fit_termination(
     config: FitConfig,
     optimizer: torch.optim.Optimizer,
 ) -> TerminationReport:
-    """Fit a model to where episodes terminated, from the weights that it has.
+    """Fit a model to the terminations of episodes, starting from its current weights.
 
-    An end by the clock, ``truncated``, is no property of the state and must not be among them.
+    An end by the clock, ``truncated``, is not a property of the state and must not count as a
+    termination.
 
     Args:
-        model: changed in place; where no transition of ``train`` ends an episode, only in that it
-            predicts no end.
+        model: the model, changed in place; if no transition of ``train`` ends an episode, it only
+            learns to predict no end.
         train: transitions ``[N]`` with ``("next", "observation")`` and ``("next", "terminated")``.
-        validation: others, which say when to stop.
-        config: as of the dynamics; shares of the data and elites do not matter.
+        validation: other transitions, which decide when to stop.
+        config: as for the dynamics; shares of the data and elites are not used.
         optimizer: over the model's parameters.
 
     Raises:
@@ -312,7 +313,7 @@ def _check(
     config: FitConfig,
     optimizer: torch.optim.Optimizer,
 ) -> None:
-    """Refuse what no model can be fitted with."""
+    """Reject data to which no model can be fitted."""
     counts = train.shape[0], validation.shape[0]
     if 0 in counts:
         raise ValueError(
@@ -330,7 +331,7 @@ def _fit(
     config: FitConfig,
     optimizer: torch.optim.Optimizer,
 ) -> FitReport:
-    """Fit the networks to the first rows and targets, and validate them on the second ones."""
+    """Fit the networks to the first rows and targets, and validate them on the second."""
     model.input_normalizer.fit(rows[0])
     model.input_normalizer.ignore((rows[0] == rows[0][:1]).all(0))
     inputs, held_out = map(model.input_normalizer.normalize, rows)
@@ -345,17 +346,17 @@ def _fit(
 
 
 def _threshold(values: Tensor, count: int) -> Tensor:
-    """What so many of the values lie above: the middle between two of them."""
+    """The value that this many of the values exceed: midway between two of them."""
     padded = torch.cat([values.sort(descending=True).values, values.new_full((1,), -torch.inf)])
     return padded[count - 1 : count + 1].mean()
 
 
 def _transitions(model: RewardModel, data: TensorDictBase, action_key: NestedKey) -> Tensor:
-    """What a model of the reward reads of transitions, where it is."""
+    """A reward model's input from transitions, on its device."""
     parts = (data["observation"], data[action_key], data["next", "observation"])
     return model.rows(*(part.to(model.device) for part in parts))
 
 
 def _column(model: OutcomeModel, data: TensorDictBase, name: str) -> Tensor:
-    """What followed the transitions, where the model is: ``(N, width)``, of its type."""
+    """The next observations of transitions ``(N, width)``, with the model's device and dtype."""
     return data["next", name].to(model.input_normalizer.mean).reshape(data.shape[0], -1)

@@ -9,32 +9,32 @@ from dataclasses import dataclass
 _SHOWN = (10, 50)
 
 MOST_GAIN_SPREAD = 0.3
-"""Disagreement on the gain above which L1 was found to be of no use, see ``docs/data.md``."""
+"""Disagreement on the gain above which L1 proved useless, see ``docs/data.md``."""
 
 
 @dataclass(frozen=True)
 class FitQuality:
-    """What a model misses of transitions that it was not trained on, per entry of the state.
+    """A model's errors on transitions that it was not trained on, per entry of the state.
 
     Attributes:
-        names: of the entries, n of them.
-        units: theirs, empty where unknown.
+        names: names of the entries, n of them.
+        units: units of the entries; empty where unknown.
         spread: standard deviation of the entry in the data, in its unit.
         change: standard deviation of its change in one step.
         rmse: root mean square error of the prediction of one step.
-        explained: share of the variance of the change that the prediction explains: 1 is perfect,
-            0 as good as the mean, NaN for an entry that never changes.
-        open_loop: root mean square error after so many steps on the model's own predictions, with
-            the actions that were recorded; NaN where no trajectory kept out of training is so
-            long, infinite where the model diverges.
-        gain_spread: how much the members of the ensemble disagree on what an action does to the
-            state: root mean square of their deviation from the mean gain, as a share of it; NaN
-            for a single member. L1 acts by this gain.
-        input_error: root mean square of the input that would explain what the model misses, per
-            entry of the action, in its unit: what L1 sees of the model's errors and of noise.
-        training: transitions trained on.
-        validation: transitions kept out of training.
-        dropped: rows of the data that were no transitions.
+        explained: share of the variance of the change that the prediction explains: 1 is perfect, 0
+            no better than the mean, NaN for an entry that never changes.
+        open_loop: root mean square error after that many steps on the model's own predictions, with
+            the recorded actions; NaN if no trajectory kept out of training is long enough, infinite
+            if the model diverges.
+        gain_spread: how much the members of the ensemble disagree on the effect of an action on the
+            state: root mean square of their deviation from the mean gain, as a share of it; NaN for
+            a single member. L1 relies on this gain.
+        input_error: root mean square of the input that would explain the model's errors, per entry
+            of the action, in its unit: how the model's errors and noise appear to L1.
+        training: number of transitions trained on.
+        validation: number of transitions kept out of training.
+        dropped: number of rows that were not transitions.
     """
 
     names: tuple[str, ...]
@@ -91,7 +91,7 @@ class FitQuality:
 
     @property
     def warning(self) -> str:
-        """Why the model is too poor for L1 to be of use; empty if nothing says so."""
+        """Why the model is too poor for L1 to be useful; empty if nothing indicates that."""
         if not self.gain_spread > MOST_GAIN_SPREAD:
             return ""
         return (
@@ -105,10 +105,10 @@ class FitQuality:
 def entry_names(
     n: int, names: Sequence[str] | None, units: Sequence[str] | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names and units of so many entries.
+    """Names or units, one per entry.
 
     Raises:
-        ValueError: if there are more or fewer.
+        ValueError: if their number is wrong.
     """
     for option, given in (("names", names), ("units", units)):
         if given is not None and (isinstance(given, str) or len(given) != n):

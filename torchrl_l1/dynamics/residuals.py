@@ -1,4 +1,4 @@
-"""What a fitted model misses: the covariance of its one-step residuals, and what L1 makes of it."""
+"""Covariance of a fitted model's one-step residuals, and what L1 derives from it."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from torch import Tensor, nn
 from torchrl_l1.control import Calibration, L1Config, calibrate
 
 SEQUENCES, STEPS = 32, 100
-"""How much of undisturbed episodes a calibration replays: so many stretches of so many steps."""
+"""The amount of undisturbed data that a calibration replays: number of stretches and of steps."""
 
-_INFLATION, _PROCESS_NOISE = 1.0, 0.01  # of a model that nobody has calibrated
+_INFLATION, _PROCESS_NOISE = 1.0, 0.01  # for a model that nobody has calibrated
 
 
 class Residuals(nn.Module):
-    """Statistics of the one-step residuals of a model on data that it was not trained on.
+    """Statistics of a model's one-step residuals on data that it was not trained on.
 
     Args:
         dim: width of the observation, n.
@@ -26,11 +26,11 @@ class Residuals(nn.Module):
     Attributes:
         covariance: second moments of the residuals, shrunk, ``(n, n)``, state units squared; the
             identity until they are measured.
-        measured: whether the covariance is of data, ``()``, bool.
+        measured: whether the covariance comes from data, ``()``, bool.
         inflation: factor on the covariance that a Kalman filter needs, ``()``; see
-            :class:`~torchrl_l1.control.ResidualStatistics`, like the next.
-        process_noise: of a disturbance, ``()``.
-        calibrated: whether these two are of data, ``()``, bool.
+            :class:`~torchrl_l1.control.ResidualStatistics`, also for the next.
+        process_noise: process noise of a disturbance, ``()``.
+        calibrated: whether these two come from data, ``()``, bool.
     """
 
     covariance: Tensor
@@ -49,10 +49,10 @@ class Residuals(nn.Module):
 
     @torch.no_grad()
     def measure(self, residual: Tensor) -> None:
-        """Take over the covariance of residuals ``(N, n)``.
+        """Measure the covariance of residuals ``(N, n)`` and store it.
 
         Raises:
-            ValueError: for residuals that are not finite, of the wrong width, or none.
+            ValueError: for residuals that are not finite, of the wrong width, or absent.
         """
         n = self.covariance.shape[0]
         if residual.ndim != 2 or residual.shape[0] < 1 or residual.shape[1] != n:
@@ -63,7 +63,7 @@ class Residuals(nn.Module):
             raise ValueError("residuals have entries that are not finite: leave them out first")
         self.covariance.copy_(shrunk_covariance(residual))
         self.measured.fill_(True)
-        # What was calibrated was of another model.
+        # Any calibration was that of another model.
         self.inflation.fill_(_INFLATION)
         self.process_noise.fill_(_PROCESS_NOISE)
         self.calibrated.fill_(False)
@@ -82,15 +82,15 @@ def shrunk_covariance(residual: Tensor) -> Tensor:
     r"""Second moments of residuals ``(N, n)``, not centred, with shrunk correlations: ``(n, n)``.
 
     A constant error of the model is an error too. Correlations are shrunk towards zero with the
-    optimal intensity (Schäfer and Strimmer, 2005), states that never missed get a variance of
-    a millionth of the median one: the result is positive definite.
+    optimal intensity (Schäfer and Strimmer, 2005); states without errors get a variance of a
+    millionth of the median one. The result is positive definite.
 
     Examples:
         >>> shrunk_covariance(torch.tensor([[1.0, 0.0], [-1.0, 0.0]]))
         tensor([[1.0000e+00, 0.0000e+00],
                 [0.0000e+00, 1.0000e-06]])
     """
-    # Sums of squares of many rows lose digits in single precision.
+    # Sums of squares over many rows lose digits in single precision.
     rows = residual.to(torch.float64)
     count, n = rows.shape
     variance = rows.square().mean(0)
@@ -107,7 +107,7 @@ def shrunk_covariance(residual: Tensor) -> Tensor:
         intensity = (noise / signal).clamp(0, 1) if bool(signal > 0) else signal.new_ones(())
     else:
         intensity = rows.new_ones(())
-    # Never exactly singular, whatever the data.
+    # Never exactly singular, whatever the data are.
     intensity = intensity.clamp_min(1e-3)
     eye = torch.eye(n, dtype=rows.dtype, device=rows.device)
     correlation = torch.lerp(correlation, eye, intensity)
@@ -124,25 +124,25 @@ def calibrate_filter(
     action_key: str = "action",
     residual_covariance: Callable[[Tensor, Tensor, str], Tensor] | None = None,
 ) -> Calibration | None:
-    """Find the inflation and the process noise that suit a model and what it has seen.
+    """Find the inflation and process noise that suit a model and the data.
 
     Args:
-        residuals: the model's, changed in place; their covariance is measured on the same data
-            where no fit has measured it.
-        value_and_jacobian: the model's, see :class:`~torchrl_l1.control.ActionJacobian`.
-        data: transitions ``[N]`` in the order in which they were collected, without
-            disturbances that the controller is to cancel; the last of them count.
+        residuals: the model's residual statistics, changed in place; their covariance is measured
+            on the same data if no fit has measured it.
+        value_and_jacobian: the model's method, see :class:`~torchrl_l1.control.ActionJacobian`.
+        data: transitions ``[N]`` in the order in which they were collected, without disturbances
+            that the controller is to cancel; the last of them are used.
         config: the controller's settings, with the bounds of the action.
-        action_key: of the action that the model was fitted to.
-        residual_covariance: the model's, needed where the settings take the ``covariance`` from
-            elsewhere than its ``"residuals"``.
+        action_key: key of the action to which the model was fitted.
+        residual_covariance: the model's method, needed if the settings take a ``covariance`` other
+            than its ``"residuals"``.
 
     Returns:
-        what :func:`~torchrl_l1.control.calibrate` found; ``None``, and no change, where no
+        the result of :func:`~torchrl_l1.control.calibrate`; ``None``, without any change, if no
         episode has 20 steps in a row.
 
     Raises:
-        ValueError: without a ``residual_covariance`` that is needed.
+        ValueError: without a ``residual_covariance`` if one is needed.
     """
     if config.covariance != "residuals" and residual_covariance is None:
         raise ValueError(
@@ -152,7 +152,7 @@ def calibrate_filter(
     rows = stretches(data)
     if rows is None:
         return None
-    # Tables are read in float64, models are mostly float32.
+    # Tables are read as float64, models are mostly float32.
     observation, action, following = (
         data[key][rows].to(residuals.covariance)
         for key in ("observation", action_key, ("next", "observation"))
@@ -179,7 +179,7 @@ def calibrate_filter(
 def stretches(data: TensorDictBase) -> Tensor | None:
     """Rows of the last unbroken stretches of episodes ``(S, T)``; ``None`` if all are too short.
 
-    A stretch goes on where the next observation of one transition is the observation of the
+    A stretch continues while the next observation of one transition is the observation of the
     following one.
     """
     following, observation = data["next", "observation"], data["observation"]

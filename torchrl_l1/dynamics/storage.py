@@ -26,7 +26,7 @@ Model = TypeVar("Model", bound=nn.Module)
 
 
 def stored_as(form: str) -> Callable[[type[Model]], type[Model]]:
-    """Decorator of a class of models that files know by this name."""
+    """Decorator for a class of models, which files refer to by this name."""
 
     def enter(kind: type[Model]) -> type[Model]:
         _FORMS[form] = kind
@@ -64,7 +64,7 @@ def load_dynamics(path: str | os.PathLike[str], device: torch.device | str = "cp
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
         raise ValueError(
-            f"{path} is damaged, or no file of EnsembleDynamics.save ({_line(error)}); the model "
+            f"{path} is damaged, or not from EnsembleDynamics.save ({_line(error)}); the model "
             "of a run is torchrl_l1.deployment.load_target(RUN_DIR).model"
         ) from None
     if metadata.get("format") != _FORMAT:
@@ -76,16 +76,16 @@ def load_dynamics(path: str | os.PathLike[str], device: torch.device | str = "cp
         )
     settings = metadata.get("settings", "")
     if metadata.get("sha256") != _digest(settings, tensors.items()):
-        raise ValueError(f"{path} is damaged: its contents are not what its checksum says")
+        raise ValueError(f"{path} is damaged: its contents do not match its checksum")
     try:
         return _restored(json.loads(settings), tensors, torch.device(device))
-    # Somebody may have made the checksum fit whatever they wrote.
+    # An attacker may have fitted the checksum to the contents.
     except Exception as error:
-        raise ValueError(f"{path} holds no model: {_line(error)}") from error
+        raise ValueError(f"{path} does not hold a model: {_line(error)}") from error
 
 
 def _settings(dynamics: Any) -> dict[str, Any]:
-    """All that :func:`_restored` needs beside the tensors."""
+    """Everything that :func:`_restored` needs besides the tensors."""
     forms = [name for name, kind in _FORMS.items() if type(dynamics) is kind]
     if not forms:
         raise TypeError(
@@ -123,14 +123,14 @@ def _restored(
 ) -> nn.Module:
     sizes = [settings["observation_dim"] + settings["action_dim"], *settings["hidden"]]
     weights = settings["members"] * sum(a * b for a, b in pairwise(sizes))
-    # Before any memory is asked for.
+    # Before any memory is requested.
     largest = max(*sizes, weights, settings["members"], settings["head"].get("dim", 0))
     if largest > sum(value.numel() for value in tensors.values()):
         raise ValueError("its layers are larger than the file")
     kind, head, quality = (settings.pop(name) for name in ("form", "head", "quality"))
     gaussian = head.pop("name") == "gaussian"
     settings["head"] = GaussianHead(**head) if gaussian else DeterministicHead()
-    # Weights are drawn that are not used: the caller's random numbers stay as they are.
+    # Weights are drawn but not used: the caller's random state stays as it is.
     with torch.random.fork_rng(devices=[]):
         dynamics: Any = _FORMS[kind](**settings)
     dynamics.to(device=device, dtype=tensors["change_normalizer.mean"].dtype)
@@ -142,7 +142,7 @@ def _restored(
 
 
 def _quality(stored: dict[str, Any]) -> FitQuality:
-    """JSON has lists for tuples, and strings for the keys of dictionaries."""
+    """Undo JSON, which has lists for tuples and strings for the keys of dictionaries."""
     loops = {int(steps): tuple(errors) for steps, errors in stored.pop("open_loop").items()}
     plain: dict[str, Any] = {
         name: tuple(v) if isinstance(v, list) else v for name, v in stored.items()

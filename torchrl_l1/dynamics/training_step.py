@@ -12,12 +12,12 @@ from torchrl_l1.dynamics.heads import Head
 
 
 class Members(Protocol):
-    """What a fit trains: the networks of an ensemble, and the head that says what they mean.
+    """What a fit trains: the networks of an ensemble, and the head that interprets them.
 
     Attributes:
         network: all members.
-        head: theirs; its parameters are trained too.
-        affine_in_action: whether :meth:`raw_from_output` changes what the networks give.
+        head: their head, whose parameters are trained too.
+        affine_in_action: whether :meth:`raw_from_output` changes the networks' output.
     """
 
     network: EnsembleMLP
@@ -26,29 +26,29 @@ class Members(Protocol):
 
     @property
     def device(self) -> torch.device:
-        """Where they are."""
+        """Device of the networks."""
 
     def network_inputs(self, inputs: Tensor) -> Tensor:
-        """What the networks read of normalised inputs."""
+        """The part of the normalised inputs that the networks read."""
 
     def raw_from_output(self, output: Tensor, inputs: Tensor) -> Tensor:
-        """What the head makes sense of, from what the networks give."""
+        """The head's input, from the networks' output."""
 
 
 class TrainingStep:
-    """Losses of all members on a batch, and the gradients of what a fit minimises.
+    """Losses of all members on a batch, and the gradients of a fit's objective.
 
-    The objective is that of :class:`~torchrl_l1.dynamics.EnsembleDynamicsLoss`, computed faster,
-    and the decay: see ``test_the_objective_is_that_of_the_loss`` in ``test_training_step.py``.
-    The network's derivatives are written out here, those of the head are its own business. In
-    ``bfloat16`` the products between hidden layers and from the last one, forward and back, and
-    what is between them are of that precision; parameters, their gradients, the input layer, and
-    what the head sees stay float32.
+    The objective is that of :class:`~torchrl_l1.dynamics.EnsembleDynamicsLoss` plus the decay,
+    computed faster: see ``test_the_objective_is_that_of_the_loss`` in ``test_training_step.py``.
+    The network's derivatives are written out here; the head provides its own. With ``bfloat16``,
+    the products between hidden layers and from the last one, forward and backward, and everything
+    between them have that precision; parameters, their gradients, the input layer and the head's
+    input stay float32.
 
     Args:
         model: the ensemble. Its parameters keep the gradients in ``grad``, always in the same
             memory.
-        precision: ``"bfloat16"``, or ``"float32"`` for that of the parameters.
+        precision: ``"bfloat16"``, or ``"float32"`` for the precision of the parameters.
         decay: coefficients of half the squared weights, one per layer, or none.
 
     Examples:
@@ -81,7 +81,7 @@ class TrainingStep:
         """Set the gradients of the model's parameters.
 
         Args:
-            inputs: normalised, of each member's own batch ``(E, B, n + m)``.
+            inputs: normalised inputs, a batch per member ``(E, B, n + m)``.
             target: normalised changes ``(E, B, n)``.
 
         Returns:
@@ -98,7 +98,7 @@ class TrainingStep:
         return losses
 
     def _head(self, output: Tensor, inputs: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        """The members' losses and the gradient by the network's output ``(E, B, out)``."""
+        """The members' losses and the gradient with respect to the output ``(E, B, out)``."""
         model = self.model
         if not model.affine_in_action:
             return model.head.loss_and_gradient(output, target)
@@ -116,7 +116,7 @@ class _Layer:
     Args:
         weight: ``(E, in, out)``.
         bias: ``(E, 1, out)``.
-        activation: of what the layer before gives; of the inputs there is none.
+        activation: applied to the previous layer's output; ``None`` for the inputs.
     """
 
     def __init__(self, weight: Tensor, bias: Tensor, activation: Activation | None = None) -> None:
@@ -124,13 +124,13 @@ class _Layer:
         self.by_weight, self.by_bias = _gradient(weight), _gradient(bias)
 
     def forward(self, z: Tensor) -> Tensor:
-        """What the layer before gives, ``(E, B, in)``, to what this one gives ``(E, B, out)``."""
+        """The previous layer's output ``(E, B, in)`` to this one's ``(E, B, out)``."""
         self._z = z
         self._units = self.activation.value(z) if self.activation else z
         return torch.bmm(self._units, self.weight).add_(self.bias)
 
     def backward(self, gradient: Tensor) -> Tensor:
-        """Set the gradients by the parameters; that by ``z`` from that by what came of it."""
+        """Set the parameters' gradients; also that with respect to ``z``, from the output's."""
         torch.sum(gradient, 1, True, out=self.by_bias)
         torch.bmm(self._units.mT, gradient, out=self.by_weight)
         if self.activation is None:
@@ -143,7 +143,7 @@ class _LowLayer(_Layer):
     """As :class:`_Layer`, in bfloat16.
 
     The bias is the weight of one more unit, which is always one: additions and sums over the rows
-    take as long as the products there.
+    would take as long as the products.
     """
 
     activation: Activation
@@ -180,5 +180,5 @@ class _LowLayer(_Layer):
 
 
 def _gradient(parameter: Tensor) -> Tensor:
-    """Where the gradient goes: for a frozen parameter, nowhere that an optimizer looks."""
+    """Where the gradient goes; for a frozen parameter, where no optimizer looks."""
     return torch.empty_like(parameter) if parameter.grad is None else parameter.grad

@@ -1,4 +1,4 @@
-"""Transitions to fit a model to, out of data as TorchRL makes them."""
+"""Transitions for fitting a model, taken from data as TorchRL makes them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchrl.data import ReplayBuffer
 
 Data: TypeAlias = TensorDictBase | ReplayBuffer | Sequence[TensorDictBase]
 
-# Shorter pieces of a long trajectory would hold no open loop of 50 steps.
+# Shorter pieces of a long trajectory could not hold an open loop of 50 steps.
 _PIECE = 100
 
 _TRAJECTORY_IDS: tuple[NestedKey, ...] = (("collector", "traj_ids"), "traj_ids")
@@ -27,14 +27,14 @@ _STEPS: tuple[NestedKey, ...] = ("steps_to_next_obs", ("next", "steps_to_next_ob
 
 @dataclass
 class Transitions:
-    """What there is to train and to validate on.
+    """Transitions to train and to validate on.
 
     Attributes:
         data: ``observation``, ``action``, ``("next", "observation")``, batch size ``[N]``, in the
             order in which they were stored.
-        validation: which are kept out of training, ``(N,)``, bool.
-        joined: which are continued by the next row, ``(N,)``, bool.
-        dropped: rows left out since they are no transitions of the system: values that are not
+        validation: transitions kept out of training, ``(N,)``, bool.
+        joined: transitions that the next row continues, ``(N,)``, bool.
+        dropped: rows left out because they are not transitions of the system: values that are not
             finite, steps across a reset.
     """
 
@@ -49,25 +49,24 @@ class Transitions:
         action_key: NestedKey = "action",
         std_floor: float = 1e-4,
     ) -> None:
-        """Warn of what no model can be told by the data.
+        """Warn about what no model can learn from the data.
 
         Args:
-            observation_key: what the observation is called where it comes from.
-            action_key: what the action is called there.
+            observation_key: name of the observation at its source.
+            action_key: name of the action there.
             std_floor: the model's smallest standard deviation.
 
         Warns:
             UserWarning: naming entries of the action that never vary, entries whose values or
                 changes vary by less than a tenth of ``std_floor``, as in units that are too large,
                 and entries of the observation whose changes vary by less than 20 steps of their
-                type. What varies by less than ``std_floor`` is not among the last.
+                type. The last kind excludes entries that vary by less than ``std_floor``.
         """
         action = self.data["action"]
         for entry in (action == action[:1]).all(0).nonzero().squeeze(-1).tolist():
             warnings.warn(
-                f"{_name(action_key)}[{entry}] never varies: what it does is not in the data, and "
-                "the model takes it for nothing, so that L1 leaves it alone; record data that move "
-                "it",
+                f"{_name(action_key)}[{entry}] never varies, so its effect is not in the data: "
+                "the model ignores it and L1 does not use it; record data that vary it",
                 stacklevel=3,
             )
         before, after = self.data["observation"], self.data["next", "observation"]
@@ -91,7 +90,7 @@ class Transitions:
             (observation, "varies by {}", x.std(0, correction=0), x.abs().amax(0)),
             (action, "varies by {}", u.std(0, correction=0), u.abs().amax(0)),
         ):
-            # What is less is the noise of numbers, or of a simulation.
+            # Anything less is noise of the numbers, or of a simulation.
             noise = (20 * torch.finfo(change.dtype).eps * size).clamp_min(1e-9)
             small = (values > noise) & (values < 0.1 * floor)
             for entry in small.nonzero().squeeze(-1).tolist():
@@ -99,7 +98,7 @@ class Transitions:
                     continue
                 told.add((name, entry))
                 warnings.warn(
-                    f"{name}[{entry}] {what.format(f'{values[entry]:.2g}')}, next to nothing for a "
+                    f"{name}[{entry}] {what.format(f'{values[entry]:.2g}')}, very little for a "
                     f"model with std_floor={floor:g}: give it in smaller units, or a std_floor of "
                     f"{values[entry] / 10:.0e}",
                     stacklevel=4,
@@ -115,38 +114,38 @@ def read_transitions(
     dtype: torch.dtype | None = None,
     device: torch.device | None = None,
 ) -> Transitions:
-    """Transitions of a tensordict or buffer, what is no transition left out, and their split.
+    """Read transitions of a tensordict or buffer, drop other rows, and split off validation data.
 
-    Two rows belong to one trajectory where the second starts with the observation that the
-    first ended with, no flag says that an episode ended between them, and ``traj_ids``, if there
-    are any, are equal. Left out are
+    Two rows belong to one trajectory if the second starts with the observation with which the first
+    ended, no flag says that an episode ended between them, and their ``traj_ids``, if any, are
+    equal. The following rows are left out:
 
-    - padding, told by the mask that ``split_trajectories`` of TorchRL writes, and steps of
-      an environment that was done before them;
+    - padding, marked by the mask that TorchRL's ``split_trajectories`` writes, and steps of an
+      environment that was already done;
     - rows with an entry that is not finite, with a warning that counts them;
-    - steps across a reset, with a warning: where an environment that resets itself reports the
-      first observation of the new episode as the last one of the old. The row after it is left
-      out too, since some such environments spend a step on the reset.
+    - steps across a reset, with a warning: an environment that resets itself may report the first
+      observation of the new episode as the last one of the old. The row after it is left out too,
+      since some such environments spend a step on the reset.
 
-    Rows with a true flag ``validation`` are kept out of training. Without one, whole
+    Rows with a true flag ``validation`` are kept out of training. Without the flag, whole
     trajectories are, drawn by ``seed`` until they hold ``validation_fraction`` of all rows;
     trajectories longer than that are cut into pieces first.
 
     Args:
-        data: a tensordict with any batch size, time last (or called ``"time"``), also a lazy stack
-            of different lengths, several of them, or a replay buffer.
-        observation_key: of the observation ``(..., n)``; ``("next", observation_key)`` is the one
-            that followed.
-        action_key: of the action ``(..., m)``.
+        data: a tensordict with any batch size, time last (or called ``"time"``), which may be a
+            lazy stack of different lengths; several tensordicts; or a replay buffer.
+        observation_key: key of the observation ``(..., n)``; ``("next", observation_key)`` is the
+            next one.
+        action_key: key of the action ``(..., m)``.
         validation_fraction: share of rows kept out of training, in (0, 1).
-        seed: of the draw.
-        dtype: of the result; torch's default if ``None``.
-        device: of the result; that of the data if ``None``.
+        seed: seed of the draw.
+        dtype: dtype of the result; torch's default if ``None``.
+        device: device of the result; that of the data if ``None``.
 
     Raises:
         KeyError: if the data lack one of the keys.
-        TypeError: for other data.
-        ValueError: if shapes do not fit, or widths of the parts differ.
+        TypeError: for data of another kind.
+        ValueError: if shapes do not fit, or widths differ between the parts.
     """
     read: list[TensorDict] = []
     trajectories = 0
@@ -162,7 +161,7 @@ def read_transitions(
         if len(widths) > 1:
             raise ValueError(
                 f"the data have {key}s of widths {', '.join(map(str, widths))} in their parts: "
-                "leave out those of another system"
+                "leave out the parts of another system"
             )
     rows: TensorDictBase = TensorDict.cat(read)
     keep = rows["real"] & _is_transition(rows, (observation_key, action_key))
@@ -178,7 +177,7 @@ def read_transitions(
 
 
 def check_time_step(data: Data, dt: float, whose: str) -> None:
-    """Refuse data of steps of another length, where they hold one (``dt``, s).
+    """Reject data with steps of another length, if they hold it (``dt``, s).
 
     Args:
         data: as :func:`read_transitions` takes them.
@@ -201,13 +200,13 @@ def check_time_step(data: Data, dt: float, whose: str) -> None:
 def split_validation(
     buffer: ReplayBuffer, purpose: str, items: str, setting: str
 ) -> tuple[TensorDictBase, TensorDictBase]:
-    """What there is to train on, and what its flag ``validation`` ``(N,)`` keeps out of it.
+    """Items to train on and items to validate on, as the flag ``validation`` ``(N,)`` says.
 
     Args:
         buffer: the items.
-        purpose: what they are for, for the error.
-        items: what they are called there.
-        setting: the one that says how many are kept out.
+        purpose: what they are for, for the error message.
+        items: what to call them there.
+        setting: the setting that decides how many are kept out.
 
     Raises:
         ValueError: if there is nothing to train or to validate on.
@@ -221,7 +220,7 @@ def split_validation(
 def two_parts(
     data: TensorDictBase, held_out: Tensor, purpose: str, items: str, setting: str
 ) -> tuple[TensorDictBase, TensorDictBase]:
-    """As :func:`split_validation`, of items ``[N]`` and what is kept out of training ``(N,)``."""
+    """As :func:`split_validation`, for items ``[N]`` and a mask ``(N,)`` of those kept out."""
     train, validation = data[~held_out], data[held_out]
     if train.shape[0] == 0 or validation.shape[0] == 0:
         raise ValueError(
@@ -251,14 +250,14 @@ def _parts(data: Data) -> list[TensorDictBase]:
 
 
 def _even(data: TensorDictBase) -> list[TensorDictBase]:
-    """The tensordict; trajectories of different lengths, stacked lazily, one by one."""
+    """The tensordict itself, or the trajectories of a lazy stack one by one."""
     if -1 not in data.shape:
         return [data]
     return [one for part in data.unbind(data.shape.index(-1) - 1) for one in _even(part)]
 
 
 def _time_last(data: TensorDictBase) -> TensorDictBase:
-    """Collectors name the dimension of time; where it is not the last one, it becomes that."""
+    """Move the dimension that collectors call time to the end, if it is not there."""
     names = data.names if data._has_names() else []
     if "time" in names[:-1]:
         data = data.transpose(names.index("time"), data.ndim - 1)
@@ -272,7 +271,7 @@ def _read(
     dtype: torch.dtype | None,
     device: torch.device | None,
 ) -> TensorDict:
-    """What is needed of a tensordict, flat, and what is known of each row."""
+    """The needed entries of a tensordict, flattened, and what is known of each row."""
     shape, next_key = data.shape, _after(observation_key)
 
     def vectors(key: NestedKey, option: str) -> Tensor:
@@ -309,7 +308,7 @@ def _read(
 def _known_of_rows(
     data: TensorDictBase, observation: Tensor, following: Tensor
 ) -> dict[str, Tensor]:
-    """Which rows the next one continues, which are to be learned from, and of what episode."""
+    """Rows that the next one continues, rows to learn from, and the episode of each."""
     here = observation.device
 
     def flag(*keys: NestedKey) -> Tensor | None:
@@ -326,7 +325,7 @@ def _known_of_rows(
         ends, before = before if before is not None else none, none
     mask, first, held_out = flag(*_PADDING), flag("is_init"), flag("validation")
     ids = _trajectory_ids(data, here)
-    # A row of a batch is followed by no other, nor is the last one.
+    # In a batch no row follows another, and nothing follows the last row.
     meets = none.clone()
     meets[:-1] = (following[:-1] == observation[1:]).all(-1)
     meets &= (torch.arange(len(meets), device=here) + 1) % max(data.shape[-1], 1) != 0
@@ -361,7 +360,7 @@ def _known_of_rows(
 
 
 def _entry(data: TensorDictBase, key: NestedKey, option: str) -> Tensor:
-    """What stands under a key, numbers."""
+    """The numbers under a key."""
     value = data.get(key, None)
     if value is None:
         there = ", ".join(sorted(_name(one) for one in data.keys(True, True)))
@@ -376,12 +375,12 @@ def _entry(data: TensorDictBase, key: NestedKey, option: str) -> Tensor:
 
 
 def _check_single_steps(data: TensorDictBase, next_key: NestedKey) -> None:
-    """Refuse what MultiStep of TorchRL left, where what followed is several steps away."""
+    """Reject data of TorchRL's MultiStep, whose next observation is several steps away."""
     for key in _STEPS:
         if (steps := data.get(key, None)) is not None and bool((steps > 1).any()):
             raise ValueError(
                 f"{_name(next_key)} is up to {int(steps.max())} steps later, as {_name(key)} says, "
-                "which MultiStep wrote: a model predicts one step, give data that it has not "
+                "which MultiStep wrote: a model predicts one step, so give data that it has not "
                 "changed"
             )
 
@@ -413,7 +412,7 @@ def _trajectory_ids(data: TensorDictBase, device: torch.device) -> Tensor | None
 
 
 def _is_transition(rows: TensorDictBase, keys: tuple[NestedKey, NestedKey]) -> Tensor:
-    """Which rows are transitions of the system; warnings count the others."""
+    """Rows that are transitions of the system; warnings count the others."""
     real, count = rows["real"], int(rows["real"].sum())
     names = {"observation": keys[0], "action": keys[1], ("next", "observation"): _after(keys[0])}
     finite = torch.ones_like(real)
@@ -434,7 +433,7 @@ def _is_transition(rows: TensorDictBase, keys: tuple[NestedKey, NestedKey]) -> T
         warnings.warn(
             f"dropped {int(across.sum())} of {count} transitions at resets: "
             f"{_name(_after(keys[0]))} of an ended episode is the observation that the next one "
-            "starts from, as an environment reports it that resets itself",
+            "starts from, as reported by an environment that resets itself",
             stacklevel=4,
         )
     return finite & ~rows["reset"]
@@ -446,7 +445,7 @@ def _nothing() -> Transitions:
 
 
 def _hold_out(groups: Tensor, fraction: float, seed: int) -> Tensor:
-    """Which rows are kept out of training, ``(N,)``, whole groups of them."""
+    """Rows kept out of training, ``(N,)``, in whole groups."""
     count = len(groups)
     wanted = max(1, min(round(fraction * count), count - 1))
     groups, sizes = groups.unique(return_inverse=True, return_counts=True)[1:]

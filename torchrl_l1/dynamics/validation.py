@@ -1,4 +1,4 @@
-"""A fitted model against transitions that it was not trained on."""
+"""Tests of a fitted model on transitions that it was not trained on."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MOST_STARTS = 500
 def one_step_residuals(
     dynamics: EnsembleDynamics, data: TensorDictBase, chunk: int = 20_000
 ) -> Tensor:
-    """What the mean of the elites misses of transitions ``[N]``: ``(N, n)``, state units.
+    """Errors of the elites' mean on transitions ``[N]``: ``(N, n)``, state units.
 
     Args:
         dynamics: the model.
@@ -49,17 +49,17 @@ def measure_quality(
     units: Sequence[str] | None = None,
     horizons: Sequence[int] = HORIZONS,
 ) -> FitQuality:
-    """The quality of a model on what of the transitions was kept out of training.
+    """The quality of a model on those transitions that were kept out of training.
 
     Args:
         dynamics: the model.
         transitions: see :func:`read_transitions`.
-        names: of the entries of the state; ``x[0]``, ``x[1]`` and so on if ``None``.
-        units: theirs, of the same number.
+        names: names of the state's entries; ``x[0]``, ``x[1]`` and so on if ``None``.
+        units: units of the same, equally many.
         horizons: steps after which the open loop is compared with the plant.
 
     Raises:
-        ValueError: if names or units are not as many as the entries.
+        ValueError: if there is not one name or unit per entry.
     """
     n = dynamics.observation_dim
     names, units = entry_names(n, names, units)
@@ -68,7 +68,7 @@ def measure_quality(
     change = held_out["next", "observation"] - x
     error = change - dynamics.mean_change(x, u)
     gains = member_gains(dynamics, x, u, transitions.data["action"].std(0, correction=0))
-    # As large as the model takes it for: the floor counts where an entry hardly moves.
+    # As the model sees it: the floor applies where an entry hardly moves.
     scale = dynamics.change_normalizer.std.double()
     total = change.double().var(0, correction=0)
     explained = 1 - error.double().square().mean(0) / total
@@ -93,13 +93,13 @@ def measure_quality(
 def open_loop_error(dynamics: EnsembleDynamics, transitions: Transitions, horizon: int) -> Tensor:
     """Root mean square error after ``horizon`` steps on the model's own predictions: ``(n,)``.
 
-    From every row kept out of training that so many others follow, with the recorded actions. NaN
-    without one, infinite where a prediction is not finite.
+    From every row kept out of training that is followed by that many others, with the recorded
+    actions. NaN if there is none, infinite if a prediction is not finite.
     """
     data, held_out = transitions.data, transitions.validation
     joined = (transitions.joined & held_out).long()
     joined[:-1] *= held_out[1:]
-    # How many links in a row begin at each row.
+    # Number of consecutive links that begin at each row.
     ends = torch.cat([joined.new_zeros(1), joined.cumsum(0)])
     last = len(joined) - horizon + 1
     if last < 1:
@@ -117,10 +117,10 @@ def open_loop_error(dynamics: EnsembleDynamics, transitions: Transitions, horizo
 
 
 def member_gains(dynamics: EnsembleDynamics, x: Tensor, u: Tensor, step: Tensor) -> Tensor:
-    """What an action does to the state in the eyes of every elite: ``(k, N, n, m)``.
+    """Effect of the action on the state according to every elite: ``(k, N, n, m)``.
 
-    By differences over a step ``(m,)`` of each entry of the action ``(N, m)`` either way: what
-    the data tell of, as the slope in a point does not.
+    By differences over a step ``(m,)`` of each entry of the action ``(N, m)`` in both directions:
+    the data determine these, but not the slope in a point.
     """
     step = step.clamp_min(1e-6)
     sides = []
@@ -133,7 +133,7 @@ def member_gains(dynamics: EnsembleDynamics, x: Tensor, u: Tensor, step: Tensor)
 
 
 def _gain_spread(gains: Tensor, scale: Tensor) -> float:
-    """Deviation of the members from their mean, of which entries of the state weigh alike."""
+    """Deviation of the members from their mean, with all entries of the state weighted alike."""
     if gains.shape[0] < 2:
         return math.nan
     gains = gains / scale[:, None]
@@ -143,7 +143,7 @@ def _gain_spread(gains: Tensor, scale: Tensor) -> float:
 
 
 def _as_input(gain: Tensor, error: Tensor, scale: Tensor) -> Tensor:
-    """Inputs ``(N, m)`` that come closest to errors ``(N, n)``, entries of the state alike."""
+    """Inputs ``(N, m)`` that best explain errors ``(N, n)``, with equal weights for all entries."""
     matrix, right = gain / scale[:, None], (error.double() / scale)[..., None]
     square = matrix.mT @ matrix
     # An input without any effect explains nothing.

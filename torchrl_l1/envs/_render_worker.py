@@ -1,8 +1,8 @@
-"""Draws MuJoCo poses off screen; run as a script in a process of its own.
+"""Draws MuJoCo poses off screen; run as a script in its own process.
 
 ``python _render_worker.py INPUT.npz MODEL.mjb OUTPUT.npy``. MuJoCo chooses its OpenGL backend when
-it is first imported, from the variable MUJOCO_GL, and a broken driver may take the process down:
-both call for a separate process. It imports nothing but MuJoCo and NumPy so that it starts fast.
+first imported, from the variable MUJOCO_GL, and a broken driver may crash the process: both require
+a separate process. The script imports only MuJoCo and NumPy so that it starts fast.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def render(model: mujoco.MjModel, qpos: np.ndarray, width: int, height: int) -> 
     Returns:
         RGB images ``(T, height, width, 3)``, uint8.
     """
-    # The buffer that the XML asks for may be smaller than the image.
+    # The buffer that the XML requests may be smaller than the image.
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
     model.vis.global_.offheight = max(model.vis.global_.offheight, height)
     data = mujoco.MjData(model)

@@ -1,9 +1,9 @@
 """Disturbances of the action on its way to the actuators.
 
-They are transforms for any TorchRL environment, batched or not. Each keeps a state of its own for
-every environment (drawn values, steps since the reset, the last inputs), which a reset renews for
-the environments that it resets. *Matched* says whether an input within the bounds of the actuators
-could cancel the disturbance if its value were known; ``compensate`` is that input.
+They are transforms for any TorchRL environment, batched or not. Each keeps a separate state for
+every environment (drawn values, steps since the reset, recent inputs), which a reset of that
+environment renews. *Matched* says whether an input within the bounds of the actuators could cancel
+the disturbance if its value were known; ``compensate`` gives that input.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from torchrl_l1.envs.disturbances import DelayLine, HeldDisturbance, Value
 
 
 class _Actuator(HeldDisturbance):
-    """A map of the action on its way to the base environment."""
+    """A transform of the action on its way to the base environment."""
 
     reason = "it changes what an environment executes"
     what = disturbs = "action"
     matched: ClassVar[bool]
 
     def _disturb(self, action: Tensor, value: Tensor) -> Tensor:
-        """What the environment executes, given the present state."""
+        """What the environment executes, given the current state."""
         raise NotImplementedError
 
     def _advance(self, action: Tensor, executed: Tensor) -> dict[str, Tensor]:
@@ -56,7 +56,7 @@ class _Actuator(HeldDisturbance):
         parent = self.parent
         if parent is not None:
             spec = parent.full_action_spec[self.key]
-            # An environment that is not batch-locked decides on more dimensions at reset.
+            # An environment that is not batch-locked may add dimensions at reset.
             extra = tensordict_reset.batch_size[: tensordict_reset.ndim - len(parent.batch_size)]
             action = spec.zero(extra)
             self._restart(action, self.resets(tensordict))
@@ -67,7 +67,7 @@ class _Actuator(HeldDisturbance):
 
 
 class _Matched(_Actuator):
-    """One that an input can cancel."""
+    """A disturbance that an input can cancel."""
 
     matched = True
 
@@ -75,13 +75,13 @@ class _Matched(_Actuator):
         raise NotImplementedError
 
     def compensate(self, action: Tensor) -> Tensor:
-        """The action which, sent through this step's disturbance, makes the plant receive another.
+        """The action that, sent through this step's disturbance, makes the plant receive another.
 
-        Call it before the step: it reads the present state (drawn value, time, walk) and changes
-        none.
+        Call it before the step: it reads the current state (drawn value, time, walk) without
+        changing it.
 
         Args:
-            action: what the plant shall receive ``(*batch, m)``.
+            action: what the plant should receive ``(*batch, m)``.
 
         Returns:
             What to send, of the same shape; it may lie beyond the bounds of the actuators.
@@ -92,14 +92,14 @@ class _Matched(_Actuator):
 
 
 class ActuatorBias(_Matched):
-    """A constant on top of every action that the environment executes: ``u + bias``.
+    """A constant added to every action that the environment executes: ``u + bias``.
 
     The textbook matched disturbance: L1 estimates and cancels it. The action in the rollout is
     unchanged.
 
     Args:
-        bias: raw action units; one number, one for each action entry, one row for each
-            environment, or drawn at resets, such as :class:`RandomSigns`.
+        bias: raw action units; one number, one for each action entry, one row for each environment,
+            or drawn at resets, for example by :class:`RandomSigns`.
         action_key: key of the action.
 
     Raises:
@@ -148,12 +148,12 @@ class _TimedBias(_VaryingBias):
 
 
 class SineBias(_TimedBias):
-    r"""A bias that swings: :math:`u + A \sin(2 \pi t / T)`, with the steps t since the reset.
+    r"""A sinusoidal bias: :math:`u + A \sin(2 \pi t / T)`, with t the steps since the reset.
 
     Matched.
 
     Args:
-        amplitude: :math:`A`, raw action units; as of :class:`ActuatorBias`.
+        amplitude: :math:`A`, raw action units; as for :class:`ActuatorBias`.
         period: :math:`T`, steps.
         action_key: key of the action.
 
@@ -175,13 +175,13 @@ class SineBias(_TimedBias):
 
 
 class StepBias(_TimedBias):
-    """A bias that sets in at a step of the episode and stays.
+    """A bias that sets in at a given step of the episode and stays.
 
     Matched.
 
     Args:
-        bias: raw action units; as of :class:`ActuatorBias`.
-        at: the first step with the bias; the first of an episode is 0.
+        bias: raw action units; as for :class:`ActuatorBias`.
+        at: the first step with the bias; the first step of an episode is 0.
         action_key: key of the action.
 
     Raises:
@@ -199,12 +199,12 @@ class StepBias(_TimedBias):
 
 
 class WalkBias(_VaryingBias):
-    """A bias that walks at random: zero at a reset, and a normal number further at every step.
+    """A random-walk bias: zero at a reset, changed by a normal random number at every step.
 
     Matched as long as it has not walked beyond the bounds of the actuators.
 
     Args:
-        deviation: standard deviation of the change in a step, raw action units; as of
+        deviation: standard deviation of the change per step, raw action units; as for
             :class:`ActuatorBias`. After k steps the bias has ``sqrt(k)`` times this deviation.
         action_key: key of the action.
 
@@ -232,8 +232,9 @@ class WalkBias(_VaryingBias):
 class ActuatorGain(_Matched):
     """A factor on every action that the environment executes: ``gain * u``.
 
-    A weakened (or overdriven) actuator. The action in the rollout is unchanged. Matched, but for
-    entries with a gain of zero: nothing reaches these, and ``compensate`` leaves them as they are.
+    A weakened (or overdriven) actuator. The action in the rollout is unchanged. Matched, except for
+    entries with a gain of zero: nothing gets through these, and ``compensate`` leaves them
+    unchanged.
 
     Args:
         gain: one number, one for each action entry, one row for each environment, or drawn at
@@ -255,14 +256,14 @@ class ActuatorGain(_Matched):
 
 
 class FailingMotor(ActuatorGain):
-    """A factor on one motor only, the others nominal.
+    """A factor on one motor only; the others are nominal.
 
-    Not matched once the motor is dead (a gain of zero); ``compensate`` does what can be done.
+    Not matched once the motor is dead (a gain of zero); ``compensate`` does what is possible.
 
     Args:
-        gain: factor on the motor's input: 1 is sound, 0 is dead; one number, one for each
+        gain: factor on the motor's input: 1 is healthy, 0 is dead; one number, one for each
             environment ``(*batch, 1)``, or drawn at resets.
-        motor: which; drawn for each environment at every reset if ``None``.
+        motor: index of the motor; drawn for each environment at every reset if ``None``.
         action_key: key of the action.
 
     Raises:
@@ -294,12 +295,12 @@ class FailingMotor(ActuatorGain):
 
 
 class DeadZone(_Matched):
-    """Inputs up to a width do nothing, larger ones lose it: ``sign(u) * max(|u| - width, 0)``.
+    """Small inputs do nothing, larger ones lose the width: ``sign(u) * max(|u| - width, 0)``.
 
     Play in a gear or a valve. Matched: its inverse adds the width.
 
     Args:
-        width: raw action units, not negative; as of :class:`ActuatorBias`.
+        width: raw action units, not negative; as for :class:`ActuatorBias`.
         action_key: key of the action.
 
     Raises:
@@ -320,14 +321,14 @@ class DeadZone(_Matched):
 
 
 class Stiction(_Actuator):
-    """The actuator sticks to what it last did until the input is further away than a band.
+    """The actuator holds its last output until the input differs from it by more than a band.
 
-    The one-parameter model of a sticking valve (Stenman, Gustafsson and Forsman 2003): it holds
-    its output, zero at a reset, while ``|u - output| <= band``, and follows the input at once
-    beyond. Not matched: what lies within the band cannot be reached in one step.
+    The one-parameter model of a sticking valve (Stenman, Gustafsson and Forsman 2003): it holds its
+    output, zero at a reset, while ``|u - output| <= band``, and otherwise follows the input at
+    once. Not matched: values within the band cannot be reached in one step.
 
     Args:
-        band: raw action units, not negative; as of :class:`ActuatorBias`.
+        band: raw action units, not negative; as for :class:`ActuatorBias`.
         action_key: key of the action.
 
     Raises:
@@ -354,12 +355,12 @@ class Stiction(_Actuator):
 
 
 class ActuatorDelay(DelayLine, _Actuator):
-    """The environment executes the action of some steps ago; zero before there was one.
+    """The environment executes the action from some steps ago; zero before there was one.
 
     Not matched: what was sent late cannot be sent earlier.
 
     Args:
-        steps: whole number; one, one for each action entry, one row for each environment, or
+        steps: a whole number; one, one for each action entry, one row for each environment, or
             drawn at resets and rounded down.
         action_key: key of the action.
 

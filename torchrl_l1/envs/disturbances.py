@@ -1,4 +1,4 @@
-"""What the disturbances of actuators and of sensors share: values, state, and delay lines."""
+"""Code common to disturbances of actuators and sensors: values, state, and delay lines."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from torchrl_l1.control import L1Transform, OracleTransform
 from torchrl_l1.control.pipeline import action_keys
 
 Draw = Callable[[torch.Size], Tensor]
-"""Makes values of a shape, or with one for all entries: drawn again as that environment resets."""
+"""Draws values of a shape, or one value for all entries; again whenever an environment resets."""
 
 Value = float | Sequence[float] | Tensor | Draw
 """A number, one for each entry, one for each environment ``(*batch, 1 or entries)``, or drawn."""
@@ -31,10 +31,10 @@ Value = float | Sequence[float] | Tensor | Draw
 
 @dataclass(frozen=True)
 class RandomSigns:
-    """A magnitude with a sign of its own for each environment and entry, drawn at every reset.
+    """A magnitude with a random sign for each environment and entry, drawn at every reset.
 
     Attributes:
-        magnitude: a number, one for each entry, one row for each environment, or drawn itself.
+        magnitude: a number, one for each entry, one row for each environment, or itself drawn.
 
     Examples:
         >>> RandomSigns(0.3)(torch.Size([4, 6])).abs().unique()
@@ -87,7 +87,7 @@ class Uniform:
 
 
 def where_stepped(tensordict: TensorDictBase, key: NestedKey, seen: Tensor) -> Tensor:
-    """What is seen after a step; before it where a ``"_step"`` mask leaves an environment out."""
+    """The value after a step, or from before it if a ``"_step"`` mask leaves an environment out."""
     stepped, before = tensordict.get("_step", None), tensordict.get(key, None)
     if stepped is None or before is None:
         return seen
@@ -95,20 +95,20 @@ def where_stepped(tensordict: TensorDictBase, key: NestedKey, seen: Tensor) -> T
 
 
 class EnvironmentTransform(Transform):
-    """A transform of environments, with the reason why stored data must not pass it."""
+    """A transform of environments, with the reason why stored data must not pass through it."""
 
     reason: ClassVar[str]
     disturbs: ClassVar[str]
 
     def check_order(self, remembers: bool) -> None:
-        """Refuse transforms before or after this one, with which it would not do what it says.
+        """Reject transforms before or after this one that would make it act incorrectly.
 
-        A controller before it, or in a transformed environment inside, takes a disturbed action for
-        the policy's. Some transforms after it step the environment through copies of it; a frame
-        skip also hands these an action that is disturbed already.
+        A controller before it, or in a transformed environment inside, would take a disturbed
+        action for the policy's. Some transforms after it step the environment through copies of it;
+        a frame skip also passes these an action that is already disturbed.
 
         Args:
-            remembers: whether this one has a state, which copies would not share.
+            remembers: whether this one has a state, which the copies would not share.
 
         Raises:
             ValueError: naming the transform and the right order.
@@ -131,8 +131,8 @@ class EnvironmentTransform(Transform):
             if is_controller and earlier.action_key == key:
                 other = type(earlier).__name__
                 raise ValueError(
-                    f"{mine} comes after {other}, so that it disturbs the policy's action and not "
-                    f"what {other} sends to the actuators: put {mine} before {other}"
+                    f"{mine} comes after {other} and so disturbs the policy's action, not what "
+                    f"{other} sends to the actuators: put {mine} before {other}"
                 )
         for later in chain[place + 1 :]:
             skips = isinstance(later, FrameSkipTransform) and later.frame_skip > 1
@@ -141,12 +141,12 @@ class EnvironmentTransform(Transform):
                 other = type(later).__name__
                 raise ValueError(
                     f"{other} comes after {mine} and steps the environment through copies of what "
-                    f"is before it, which would disturb it in another way: put {other} before "
+                    f"is before it, which would disturb it differently: put {other} before "
                     f"{mine}, or around it, TransformedEnv(env, {other}(...), auto_unwrap=False)"
                 )
 
     def _environment(self) -> EnvBase | None:
-        """The environment, if there is one.
+        """The environment.
 
         Raises:
             RuntimeError: in a replay buffer.
@@ -157,10 +157,10 @@ class EnvironmentTransform(Transform):
             raise RuntimeError(self._refusal()) from None
 
     def resets(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Which environments are reset.
+        """Environments being reset.
 
         Returns:
-            mask ``(*batch, 1)``, bool, true where anything of an environment is; ``None`` where
+            mask ``(*batch, 1)``, bool, true where any part of an environment is reset; ``None`` if
             all are.
         """
         environment = self._environment()
@@ -168,7 +168,7 @@ class EnvironmentTransform(Transform):
         return _any_of([tensordict.get(key, None) for key in keys], tensordict.batch_size)
 
     def begun(self, next_tensordict: TensorDictBase) -> Tensor | None:
-        """Where an environment that resets itself within a step has begun an episode.
+        """Environments that reset themselves within the step and have begun an episode.
 
         Returns:
             mask ``(*batch, 1)``, bool: what is observed there is the first of that episode;
@@ -182,7 +182,7 @@ class EnvironmentTransform(Transform):
         return _any_of(flags, next_tensordict.batch_size)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Refuse to work on stored data.
+        """Reject stored data.
 
         Raises:
             RuntimeError: always.
@@ -197,16 +197,16 @@ class EnvironmentTransform(Transform):
 
 
 def _any_of(flags: Sequence[Tensor | None], batch: torch.Size) -> Tensor | None:
-    """Where any of them is set ``(*batch, 1)``; ``None`` where there are none."""
+    """Where any of them is set ``(*batch, 1)``; ``None`` if there are none."""
     found = [flag.reshape(*batch, -1).any(-1, True) for flag in flags if flag is not None]
     return torch.stack(found).any(0) if found else None
 
 
 class HeldDisturbance(EnvironmentTransform):
-    """Holds the value of a disturbance, and its state: tensors whose first axes are the batch.
+    """Holds the value of a disturbance and its state: tensors whose leading axes are the batch.
 
-    Subclasses say how an episode begins; the state is replaced, never written to, so that copies
-    of a transform do not share it.
+    Subclasses define how an episode begins. The state is replaced, never written to, so copies of a
+    transform do not share it.
     """
 
     what: ClassVar[str] = "entry"
@@ -223,16 +223,16 @@ class HeldDisturbance(EnvironmentTransform):
             )
         if tensor is not None:
             self._check(tensor)
-        # It is a setting: weights of another environment must not bring theirs along.
+        # It is a setting: loading another environment's weights must not overwrite it.
         self.register_buffer("value", tensor, persistent=False)
         self._state: Mapping[str, Tensor] = {}
         self._following: Mapping[str, Tensor] = {}
 
     def _check(self, value: Tensor) -> None:
-        """Refuse values that the disturbance cannot have."""
+        """Reject values that the disturbance cannot have."""
 
     def _admitted(self, drawn: Tensor) -> Tensor:
-        """What is drawn, as a value that the disturbance can have."""
+        """The drawn value as one that the disturbance can have."""
         return drawn
 
     def _require(self, sound: bool, rule: str, value: Tensor) -> None:
@@ -258,7 +258,7 @@ class HeldDisturbance(EnvironmentTransform):
     def _restart(self, entry: Tensor, reset: Tensor | None) -> None:
         self._check_shape(entry)
         if reset is None:
-            self._state = {}  # which may have been that of another number of environments
+            self._state = {}  # may have been for another number of environments
         self._check_batch(self._state, entry.shape[:-1])
         state = self._drawn(entry)
         self._keep(state, reset, entry.shape[:-1])
@@ -270,17 +270,17 @@ class HeldDisturbance(EnvironmentTransform):
         self._check_batch(self._state, entry.shape[:-1])
 
     def _check_batch(self, state: Mapping[str, Tensor], batch: torch.Size) -> None:
-        """Refuse a state of other environments than those that step or are reset.
+        """Reject a state for environments other than those that step or are reset.
 
         Raises:
-            ValueError: naming the numbers of both.
+            ValueError: naming both batch sizes.
         """
         sizes = {tuple(value.shape[: len(batch)]) for value in state.values()} - {tuple(batch)}
         if sizes:
             raise ValueError(
                 f"{type(self).__name__} has a state of batch {sizes.pop()}, but {tuple(batch)} "
                 "steps, of an environment that is not batch-locked: steps cannot be left out there "
-                "(ConditionalSkip, or rollouts that go on without environments that are done)"
+                "(ConditionalSkip, or rollouts that continue without environments that are done)"
             )
 
     def _keep(self, state: Mapping[str, Tensor], where: Tensor | None, batch: torch.Size) -> None:
@@ -296,7 +296,7 @@ class HeldDisturbance(EnvironmentTransform):
         self._state = {**self._state, **state}
 
     def _current(self, entry: Tensor) -> Tensor:
-        """The value by which an entry is disturbed now."""
+        """The current value by which an entry is disturbed."""
         value = self._state["value"] if self.draw is not None else self.value
         assert isinstance(value, Tensor)
         return value.to(entry)
@@ -323,12 +323,12 @@ class HeldDisturbance(EnvironmentTransform):
 
 
 def _with_axes_of(entry: Tensor, mask: Tensor) -> Tensor:
-    """A mask of the batch with further axes at its end, to be broadcast to an entry."""
+    """A mask of the batch with trailing axes added, to be broadcast to an entry."""
     return mask.reshape(*mask.shape, *(1,) * (entry.ndim - mask.ndim))
 
 
 class DelayLine(HeldDisturbance):
-    """Delivers what came in a number of steps ago."""
+    """Delivers the value from a number of steps ago."""
 
     def _admitted(self, drawn: Tensor) -> Tensor:
         return drawn.floor()
@@ -341,7 +341,7 @@ class DelayLine(HeldDisturbance):
         """The last entries, oldest first ``(*batch, entries, length)``, as if all were this one."""
         length = int(self._current(entry).max()) + 1
         present = self._state.get("line")
-        # What is drawn for some must not shorten the memory of the others.
+        # A draw for some environments must not shorten the memory of the others.
         length = length if present is None else max(length, present.shape[-1])
         return entry.unsqueeze(-1).expand(*entry.shape, length)
 

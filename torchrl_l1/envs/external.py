@@ -1,4 +1,4 @@
-"""Tasks of elsewhere: what algorithms need to know of one, read from the environment itself."""
+"""Tasks from elsewhere: what algorithms need to know, read from the environment itself."""
 
 from __future__ import annotations
 
@@ -37,28 +37,28 @@ from torchrl_l1.envs.task import BadAction, RewardFn, Scalars, Task
 
 
 class ExternalTask:
-    """What algorithms need to know of an environment that is no task of ours.
+    """What algorithms need to know of an environment that is not one of our tasks.
 
-    It stands beside :class:`Task`: widths, bounds, time step and horizon are read from the
-    environment, which is made as often as episodes are collected side by side.
+    The counterpart of :class:`Task`: widths, bounds, time step and horizon are read from the
+    environment, of which one instance is made for each episode collected in parallel.
 
     Args:
         source: makes the environment.
-        dt: seconds of a step, where the environment does not tell.
-        horizon: steps of an episode, where the environment does not tell, or fewer.
-        observation_keys: parts of an observation that comes in parts, in this order.
+        dt: seconds per step, if the environment does not declare it.
+        horizon: steps per episode, if the environment does not declare it, or a smaller number.
+        observation_keys: parts that make up the observation, in this order, if it has several.
 
     Attributes:
-        name: of the source.
+        name: name of the source.
         observation_dim: width of the observation.
         action_dim: width of the action.
-        action_low: lower bound of the actions, one number where all entries have the same.
+        action_low: lower bound of the actions; a single number if it is the same for all entries.
         action_high: upper bound.
-        outcome: reward and termination, where they are known functions of the observation.
+        outcome: reward and termination, if they are known functions of the observation.
 
     Raises:
-        ValueError: for an environment that no algorithm here can act in, or one that does not tell
-            what must be known, with the setting to give.
+        ValueError: for an environment in which no algorithm here can act, or one that lacks
+            necessary information, with the setting that supplies it.
 
     Examples:
         >>> task = ExternalTask(environment_source("gymnasium/Pendulum-v1"))
@@ -104,14 +104,14 @@ class ExternalTask:
 
     def _told(self, key: str, unit: str, what: str, given: Any, told: Any) -> Any:
         if told is None and given is None:
-            raise ValueError(f"{self.name} does not tell {what}: give {key}={unit} ({PAGE})")
+            raise ValueError(f"{self.name} does not declare {what}: give {key}={unit} ({PAGE})")
         return given if told is None else told
 
     def _single(self, limited: bool = True) -> SingleEnv:
-        """One environment, by itself.
+        """A single environment.
 
         Args:
-            limited: whether episodes end when the environment's own horizon says so.
+            limited: whether episodes end at the environment's own horizon.
         """
         if self.source.gymnasium_id:
             options: dict[str, Any] = {} if limited else {"max_episode_steps": -1}
@@ -157,14 +157,14 @@ class ExternalTask:
         return self.outcome
 
     def sample_starts(self, count: int) -> Tensor:
-        """First observations of so many episodes ``(count, n)``, seeded by torch's generator."""
+        """``count`` initial observations ``(count, n)``, seeded by torch's generator."""
         env = self.environment(1)
         starts = [env.reset()["observation"] for _ in range(count)]
         env.close()
         return torch.cat(starts)
 
     def check_disturbances(self, names: Sequence[str]) -> None:
-        """Refuse changes of a plant that cannot be reached.
+        """Reject changes of a plant that cannot be accessed.
 
         Raises:
             ValueError: naming the disturbance.
@@ -174,7 +174,7 @@ class ExternalTask:
                 raise ValueError(cannot_change(self.name, name))
 
     def environment(self, num_envs: int, **settings: Any) -> ExternalEnv:
-        """So many environments side by side, see :class:`ExternalEnv`."""
+        """That many environments side by side, see :class:`ExternalEnv`."""
         return ExternalEnv(self, num_envs, **settings)
 
 
@@ -184,30 +184,30 @@ def _scalars(bound: np.ndarray) -> Scalars:
 
 
 class ExternalEnv(CPUEnv):
-    """Environments of elsewhere side by side in one process, as :class:`BatchedMujocoEnv` has ours.
+    """Environments from elsewhere in one process, the counterpart of :class:`BatchedMujocoEnv`.
 
-    Every reset of each is seeded from the seed of the whole, so that what follows depends on
-    nothing that was before. Actions are clipped to the bounds, as an actuator would. Where an
-    observation or reward is not finite, or MuJoCo's simulation turned bad, that step has
+    Every reset of each environment is seeded from the batch's seed, so what follows does not depend
+    on what happened before. Actions are clipped to the bounds, as an actuator would. If an
+    observation or reward is not finite, or MuJoCo's simulation has become unstable, that step has
     ``("next", "non_finite")`` and ``("next", "terminated")`` set, its next observation repeats the
     last good one and its reward is zero. Environments that a ``"_step"`` mask leaves out stay as
     they are.
 
     Args:
-        task: what the environments are.
-        num_envs: how many; the batch size is ``[num_envs]``.
+        task: the task of the environments.
+        num_envs: number of environments; the batch size is ``[num_envs]``.
 
     Keyword Args:
-        seed: seed of the resets; drawn from torch's global generator if ``None``, another one in
-            each worker of :mod:`multiprocessing`.
+        seed: seed of the resets; drawn from torch's global generator if ``None``, a different one
+            in each worker of :mod:`multiprocessing`.
         max_steps: steps after which an episode is truncated; the task's horizon if ``None``.
         dtype: floating dtype of observation, action and reward.
-        threads: no more than one thread steps them.
-        plant: changes of the plant by name, of Gymnasium's MuJoCo environments; each a number, one
+        threads: accepted, but a single thread steps the environments.
+        plant: changes of the plant by name, for Gymnasium's MuJoCo environments; each a number, one
             for each environment, or drawn at resets.
 
     Raises:
-        ValueError: if a count is not positive, or for a plant that cannot be changed so.
+        ValueError: if a count is not positive, or for a plant that cannot be changed like this.
 
     Examples:
         >>> env = ExternalTask(environment_source("gymnasium/Pendulum-v1")).environment(3, seed=0)
@@ -315,7 +315,7 @@ class ExternalEnv(CPUEnv):
         )
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Free all environments."""
+        """Close all environments."""
         for member in self.members:
             member.close()
         super().close(raise_if_closed=raise_if_closed)
@@ -328,10 +328,10 @@ def external_task(
     observation_keys: tuple[str, ...] = (),
     search_path: tuple[str | Path, ...] = (),
 ) -> Task | ExternalTask:
-    """The task that an environment of that name is; a :class:`Task` where a function returns one.
+    """The task of an environment by its name; a :class:`Task` if a function returns one.
 
     Raises:
-        ValueError: for a name that stands for nothing, or an environment that will not do.
+        ValueError: for a name that means nothing, or an environment that cannot be used.
     """
     code = code_digests([name], search_path)
     return _read(name, dt, horizon, observation_keys, search_path, Path.cwd(), *code.items())
@@ -346,7 +346,7 @@ def _read(
     search_path: tuple[str | Path, ...],
     *state: object,
 ) -> Task | ExternalTask:
-    """Read once, for each state of the folder and the code that the name leads to."""
+    """Read once for each state of the folder and the code to which the name leads."""
     source = environment_source(name, search_path)
     if source.task is not None:
         return source.task

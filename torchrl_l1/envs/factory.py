@@ -1,4 +1,4 @@
-"""From a name to a task, or to an environment with noise, disturbances that act, controllers."""
+"""Turns a name into a task, or into an environment with noise, disturbances and controllers."""
 
 from __future__ import annotations
 
@@ -39,23 +39,23 @@ def get_task(
     observation_keys: Sequence[str] = (),
     search_path: Sequence[str | Path] = (),
 ) -> AnyTask:
-    """Look a task up by name; a task passes through.
+    """Look up a task by name; a task is returned as it is.
 
     Args:
-        task: a key of :data:`~torchrl_l1.envs.TASKS`, the name of any environment as
-            :func:`~torchrl_l1.envs.environment_source` takes it, or a task of your own.
-        dt: seconds of a step, where an environment of elsewhere does not tell.
-        horizon: steps of an episode, where an environment of elsewhere does not tell, or fewer.
-        observation_keys: parts of the observation, where that of an environment comes in parts.
-        search_path: folders for files and modules that the name names.
+        task: a key of :data:`~torchrl_l1.envs.TASKS`, any other environment's name that
+            :func:`~torchrl_l1.envs.environment_source` accepts, or a task of your own.
+        dt: seconds per step, if an environment from elsewhere does not declare it.
+        horizon: steps per episode, if an environment from elsewhere does not declare it, or fewer.
+        observation_keys: parts that make up the observation, if an environment has several.
+        search_path: folders for files and modules in the name.
 
     Returns:
         The task.
 
     Raises:
         KeyError: if no task has this name; the message lists those that exist.
-        ValueError: for an environment that is not there or will not do, or that does not tell what
-            must be known.
+        ValueError: for an environment that does not exist or cannot be used, or that lacks
+            necessary information.
 
     Examples:
         >>> get_task("half_cheetah").observation_dim
@@ -104,14 +104,14 @@ def make_env(
 ) -> TransformedEnv:
     r"""Build a benchmark environment with noise, disturbances and further transforms.
 
-    The transforms stand in the order ``[*actuators, ActionNoise, ObservationNoise, *sensors,
-    *extra_transforms]``, neutral ones left out. Actions travel from the last to the first, and
-    actuators stand such that the first of :data:`~torchrl_l1.envs.DISTURBANCES` acts first; so
-    do sensors, as observations travel from the first to the last. Changes of the plant are none
-    of transforms but of the simulation.
+    The transforms are in the order ``[*actuators, ActionNoise, ObservationNoise, *sensors,
+    *extra_transforms]``, without neutral ones. Actions pass from the last to the first, and the
+    actuators are ordered so that the first of :data:`~torchrl_l1.envs.DISTURBANCES` acts first; so
+    are the sensors, although observations pass from the first to the last. Changes of the plant are
+    not transforms but part of the simulation.
 
-    A controller among ``extra_transforms`` therefore sees the noisy observation, and for its
-    output :math:`u` the simulator receives with noise, bias and gain
+    A controller among ``extra_transforms`` therefore sees the noisy observation. When it sends
+    :math:`u`, the simulator receives, with noise, bias and gain,
 
     .. math:: g \, (u + \xi + b), \qquad \xi \sim U(-w, w),
 
@@ -119,7 +119,7 @@ def make_env(
     the gain scales. The rollout's ``"action"`` is what the policy wrote.
 
     Args:
-        task: a key of :data:`~torchrl_l1.envs.TASKS`, any other name that :func:`get_task` takes,
+        task: a key of :data:`~torchrl_l1.envs.TASKS`, any other name that :func:`get_task` accepts,
             or a task itself.
         num_envs: number of environments.
         action_noise: half-width of :class:`~torchrl_l1.envs.ActionNoise`.
@@ -129,21 +129,21 @@ def make_env(
         max_steps: steps after which an episode is truncated; the task's horizon if ``None``.
         dtype: floating dtype of observation, action and reward.
         threads: threads that share the physics.
-        dt: as :func:`get_task` takes it.
-        horizon: as there.
-        observation_keys: as there.
-        search_path: as there.
+        dt: as for :func:`get_task`.
+        horizon: likewise.
+        observation_keys: likewise.
+        search_path: likewise.
         **disturbances: values of the disturbances of :class:`~torchrl_l1.envs.Perturbation`, by
-            their settings or by their names in :data:`~torchrl_l1.envs.DISTURBANCES`. Each is
-            what its transform takes (a number, one for each entry, one row for each environment)
-            or, of the plant, a number or one for each environment; or drawn at resets.
+            setting or by name in :data:`~torchrl_l1.envs.DISTURBANCES`. Each is what its transform
+            accepts (a number, one for each entry, one row for each environment) or, for the plant,
+            a number or one for each environment; or drawn at resets.
 
     Returns:
         A ``TransformedEnv`` with batch size ``[num_envs]``.
 
     Raises:
         KeyError: if the task is unknown.
-        TypeError: for any other argument, or a disturbance that is given twice.
+        TypeError: for an unknown argument, or a disturbance that is given twice.
         ValueError: if a half-width is negative, or a disturbance cannot have its value.
 
     Examples:
@@ -183,7 +183,7 @@ def make_env(
 
 
 def episode_steps(source: EnvironmentSource) -> float:
-    """Steps after which an episode is truncated; infinite where nobody says so."""
+    """Steps after which an episode is truncated; infinite if there is no limit."""
     if source.task is not None:
         return source.task.horizon
     told = gymnasium.spec(source.gymnasium_id).max_episode_steps if source.gymnasium_id else None
@@ -191,17 +191,17 @@ def episode_steps(source: EnvironmentSource) -> float:
 
 
 def acting_on(source: EnvironmentSource, horizon: float) -> Callable[[Mapping[str, float]], bool]:
-    """Tells disturbances that can act on an environment from those that cannot.
+    """Distinguish disturbances that can act on an environment from those that cannot.
 
-    The latter are changes of a plant that cannot be reached, or that has nothing that they would
-    change (friction where nothing touches), and what begins when episodes are over.
+    The latter are changes of a plant that cannot be accessed or that lacks what they would change
+    (friction where nothing touches), and those that begin after the end of an episode.
 
     Args:
         source: makes the environment.
         horizon: steps of an episode.
 
     Returns:
-        a function of disturbances by name, whether each of them can act.
+        a function that maps a dictionary of disturbances to whether all of them can act.
 
     Examples:
         >>> from torchrl_l1.envs import environment_source

@@ -18,20 +18,20 @@ _ONLY = np.zeros(1, dtype=np.int64)
 
 
 class MujocoTaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """One environment of a benchmark task, for Gymnasium and what builds on it.
+    """One environment of a benchmark task, for Gymnasium and libraries based on it.
 
-    Facts and physics are those of :class:`~torchrl_l1.envs.BatchedMujocoEnv`; only the horizon is
-    left to Gymnasium: ``gymnasium.make("torchrl_l1/HalfCheetah-v0")`` adds its ``TimeLimit``.
-    Observations are float64 and clean. The action space holds the actuators' range; actions
-    outside it are passed on as they are, and clipped where physics and reward of the task do so.
+    Task data and physics are those of :class:`~torchrl_l1.envs.BatchedMujocoEnv`; only the horizon
+    is left to Gymnasium: ``gymnasium.make("torchrl_l1/HalfCheetah-v0")`` adds its ``TimeLimit``.
+    Observations are float64 and without noise. The action space is the actuators' range; actions
+    outside it are passed on unchanged, and clipped where the task's physics and reward do so.
 
-    A step on which the simulation turns bad terminates the episode with the last good observation
-    and has ``info["non_finite"]`` set.
+    If the simulation becomes unstable in a step, the episode terminates with the last good
+    observation and ``info["non_finite"]`` set.
 
     Args:
         task: a key of :data:`~torchrl_l1.envs.TASKS`, or a :class:`~torchrl_l1.envs.Task`.
-        render_mode: ``None`` or ``"rgb_array"``. Frames come from the XML's ``track`` camera where
-            it has one.
+        render_mode: ``None`` or ``"rgb_array"``. Frames come from the XML's ``track`` camera if it
+            has one.
         width: width of a frame in pixels.
         height: height of a frame in pixels.
 
@@ -75,10 +75,10 @@ class MujocoTaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Start an episode.
 
         Args:
-            seed: seed of this and all following resets; they continue from the last seed if
-                ``None``. With the same seed the first reset is that of a
+            seed: seed of this and all following resets; if ``None``, they continue from the last
+                seed. With the same seed the first reset equals that of a
                 :class:`~torchrl_l1.envs.BatchedMujocoEnv` with one environment.
-            options: none are known.
+            options: not used.
 
         Returns:
             The observation ``(n,)`` and an empty dictionary.
@@ -134,14 +134,14 @@ class MujocoTaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._simulation.observation[0].numpy().copy()
 
     def render(self) -> np.ndarray | None:
-        """A frame ``(height, width, 3)`` of the current state, uint8; ``None`` if not asked for.
+        """A frame ``(height, width, 3)`` of the current state, uint8; ``None`` without render mode.
 
         Raises:
             RuntimeError: if OpenGL cannot draw off screen here.
         """
         if self.render_mode is None:
             gymnasium.logger.warn(
-                "render() does nothing without a render mode: make the environment with "
+                "render() does nothing without a render mode: create the environment with "
                 'render_mode="rgb_array".'
             )
             return None
@@ -163,14 +163,14 @@ class MujocoTaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         buffer.offheight = max(buffer.offheight, self.height)
         try:
             return mujoco.Renderer(model, self.height, self.width)
-        except Exception as error:  # every OpenGL binding has exceptions of its own
+        except Exception as error:  # every OpenGL binding has its own exceptions
             raise RuntimeError(
                 "MuJoCo cannot draw off screen here; set the environment variable MUJOCO_GL to egl "
                 "or osmesa before Python starts, and install that backend (libegl1, libosmesa6)"
             ) from error
 
     def close(self) -> None:
-        """Free the renderer, if there is one."""
+        """Close the renderer, if there is one."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None

@@ -1,8 +1,8 @@
 r"""Rewards and terminations of known Gymnasium tasks, as functions of the observation.
 
-They are for imagination, where there is nothing but the observation. Weights and ranges are those
-of the environment at hand. Most are exact; where the reward takes the displacement of a body whose
-position is not in the observation, the velocities before and after the step stand for it.
+They are for imagination, where nothing but the observation exists. Weights and ranges are those of
+the given environment. Most are exact; if the reward uses the displacement of a body whose position
+is not in the observation, it is computed from the velocities before and after the step.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Outcome:
     Attributes:
         reward: ``(observation (..., n), action (..., m), next_observation (..., n)) -> (...)``.
         terminated: ``next_observation (..., n) -> bool (...)``.
-        note: where the reward is not exact, why.
+        note: why the reward is not exact, if it is not.
     """
 
     reward: RewardFn
@@ -50,11 +50,11 @@ def known_outcome(env: gymnasium.Env[Any, Any]) -> Outcome | None:
     """Reward and termination of one of Gymnasium's own environments.
 
     Args:
-        env: as :func:`gymnasium.make` returns it. Wrappers that may change observation, action or
-            reward make it another one.
+        env: as returned by :func:`gymnasium.make`. Wrappers that may change observation, action or
+            reward make it a different environment.
 
     Returns:
-        ``None`` for one that is not known.
+        ``None`` for an unknown environment.
 
     Examples:
         >>> pendulum = known_outcome(gymnasium.make("Pendulum-v1"))
@@ -120,7 +120,9 @@ def _double_pendulum(env: Any) -> Outcome:
         speed = 1e-3 * first.square() + 5e-3 * second.square()
         return env._healthy_reward * (y > 1).to(y) - distance - speed
 
-    return Outcome(reward, fallen, "angular velocities beyond 10 rad/s are cut in the observation")
+    return Outcome(
+        reward, fallen, "angular velocities beyond 10 rad/s are clipped in the observation"
+    )
 
 
 def _reacher(env: Any) -> Outcome:
@@ -147,19 +149,19 @@ def _pusher(env: Any) -> Outcome:
 
 
 def _forward(env: Any, left_out: int, root: int) -> tuple[RewardFn, str]:
-    """Weighted forward speed of a body less the cost of the action, and why it is not exact.
+    """Weighted forward speed of a body minus the cost of the action, and why it is not exact.
 
     Args:
         env: the environment.
-        left_out: positions that the observation leaves out, where it does.
-        root: position of the forward velocity among all velocities.
+        left_out: positions that the observation leaves out, if any.
+        root: index of the forward velocity among all velocities.
     """
     hidden = env._exclude_current_positions_from_observation
     weight, cost = env._forward_reward_weight, env._ctrl_cost_weight
     place = env.model.nq - (left_out if hidden else 0) + root
     steps = env.frame_skip
-    # The mean velocity of a step: of positions that follow each new velocity (semi-implicit), or
-    # of the whole motion (Runge-Kutta), for a velocity that changes evenly.
+    # The mean velocity of a step: for positions that follow each new velocity (semi-implicit), or
+    # for the whole motion (Runge-Kutta), given a velocity that changes evenly.
     semi_implicit = env.model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
     after = (steps + 1) / (2 * steps) if semi_implicit else 0.5
 
@@ -185,7 +187,7 @@ def _swimmer(env: Any) -> Outcome:
 
 
 def _walking(env: Any, healthy: Callable[[Tensor], Tensor]) -> Outcome:
-    """A runner that earns something for as long as it is healthy, and may end when it is not."""
+    """A runner that earns a bonus while it is healthy, and may end when it is not."""
     forward, note = _forward(env, left_out=1, root=0)
 
     def reward(observation: Tensor, action: Tensor, following: Tensor) -> Tensor:
@@ -242,9 +244,9 @@ def _ant(env: Any) -> Outcome | None:
         return ~healthy(following)
 
     if not note:
-        note = "the forward speed is that of the torso a substep before"
+        note = "the forward speed is that of the torso one substep earlier"
     if env._contact_cost_weight:
-        note += ", and what the ground is pressed with costs something and is not observed"
+        note += ", and contact forces have a cost but are not observed"
     return Outcome(reward, fallen if env._terminate_when_unhealthy else never, note)
 
 

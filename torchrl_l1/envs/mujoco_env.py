@@ -24,10 +24,10 @@ class CPUEnv(EnvBase):
     """An environment whose physics is on the CPU."""
 
     def to(self, device: DEVICE_TYPING) -> EnvBase:
-        """Itself on the CPU.
+        """Return it unchanged on the CPU.
 
         Raises:
-            ValueError: for another device.
+            ValueError: for any other device.
         """
         if torch.device(device).type != "cpu":
             raise ValueError(
@@ -40,7 +40,7 @@ class CPUEnv(EnvBase):
 def drawn_seed() -> int:
     """A seed from torch's global generator, of which forked workers have equal copies.
 
-    Those of :mod:`multiprocessing` are told apart by their numbers.
+    Workers of :mod:`multiprocessing` get different seeds by their numbers.
     """
     drawn = int(torch.empty((), dtype=torch.int64).random_())
     worker = multiprocessing.current_process()._identity
@@ -52,13 +52,13 @@ def drawn_seed() -> int:
 def declare_specs(
     env: EnvBase, observation_dim: int, action_spec: Bounded, dtype: torch.dtype
 ) -> None:
-    """Say what a batch of environments takes and gives: what all of ours have in common.
+    """Set the specs that all our batched environments have in common.
 
     Args:
-        env: its batch size is set.
+        env: the environment, whose batch size is set.
         observation_dim: width of the observation.
-        action_spec: of the action.
-        dtype: of observation and reward.
+        action_spec: spec of the action.
+        dtype: dtype of observation and reward.
     """
     batch = env.batch_size
     flag = Binary(shape=(*batch, 1), dtype=torch.bool)
@@ -74,7 +74,7 @@ def declare_specs(
 
 
 def reset_rows(tensordict: TensorDictBase | None, num_envs: int) -> np.ndarray:
-    """Indices of the environments that a ``"_reset"`` mask names; all where there is no mask."""
+    """Indices of the environments selected by a ``"_reset"`` mask; all without a mask."""
     mask = None if tensordict is None else tensordict.get("_reset", None)
     if mask is None:
         return np.arange(num_envs)
@@ -82,13 +82,13 @@ def reset_rows(tensordict: TensorDictBase | None, num_envs: int) -> np.ndarray:
 
 
 def stepped_rows(tensordict: TensorDictBase, num_envs: int) -> Tensor | None:
-    """Which environments a ``"_step"`` mask lets step ``(N,)``; ``None`` where there is no mask."""
+    """Environments that a ``"_step"`` mask lets step ``(N,)``; ``None`` without a mask."""
     mask = tensordict.get("_step", None)
     return None if mask is None else mask.reshape(num_envs, -1).any(-1)
 
 
 def keep_others(data: TensorDict, tensordict: TensorDictBase, stepped: Tensor) -> TensorDict:
-    """Give environments that took no step the flags that they had, and a reward of zero."""
+    """Give environments that took no step their previous flags, and a reward of zero."""
     mask = stepped.unsqueeze(-1)
     for name in ("non_finite", "terminated", "truncated", "done"):
         before = tensordict.get(name, None)
@@ -101,39 +101,39 @@ def keep_others(data: TensorDict, tensordict: TensorDictBase, stepped: Tensor) -
 class BatchedMujocoEnv(CPUEnv):
     """A MuJoCo benchmark task with ``num_envs`` environments in one process.
 
-    The physics is Gymnasium's to the bit (the same XML and ``mj_step``, the whole integration state
-    kept from step to step); observations, rewards, resets and termination come from the
-    :class:`Task`. Environments reset independently through the usual ``"_reset"`` mask. Those
-    that a ``"_step"`` mask leaves out stay as they are, with a reward of zero.
+    The physics is bit-identical to Gymnasium's (the same XML and ``mj_step``, with the whole
+    integration state kept from step to step); observations, rewards, resets and termination come
+    from the :class:`Task`. Environments reset independently through the usual ``"_reset"`` mask.
+    Those that a ``"_step"`` mask leaves out stay as they are, with a reward of zero.
 
     Reward and termination are evaluated in float64 on the clean state and on the action that this
-    environment receives (noise and disturbances upstream included, before MuJoCo's clamping).
+    environment receives (with upstream noise and disturbances, before MuJoCo's clamping).
 
-    If the simulation of one environment turns bad (not finite, or beyond 1e10), or the task makes
-    an observation or reward of it that is not finite, that step has ``("next", "non_finite")`` and
-    ``("next", "terminated")`` set, its next observation repeats the last good one and its reward is
-    finite. Count these steps, and keep them out of a dynamics model's data: the transition that
-    they show did not happen.
+    If the simulation of one environment becomes unstable (not finite, or beyond 1e10), or its
+    observation or reward is not finite, that step has ``("next", "non_finite")`` and ``("next",
+    "terminated")`` set, its next observation repeats the last good one and its reward is finite.
+    Count these steps, and keep them out of a dynamics model's data: the transition that they show
+    did not happen.
 
     Args:
         task: a key of :data:`~torchrl_l1.envs.TASKS`, or a :class:`~torchrl_l1.envs.Task`.
         num_envs: number of environments ``N``; the batch size is ``[N]``.
 
     Keyword Args:
-        seed: seed of the resets; drawn from torch's global generator if ``None``, another one in
-            each worker of :mod:`multiprocessing`.
+        seed: seed of the resets; drawn from torch's global generator if ``None``, a different one
+            in each worker of :mod:`multiprocessing`.
         max_steps: steps after which an episode is truncated; the task's horizon if ``None``.
         dtype: floating dtype of observation, action and reward.
         threads: threads that share the physics; the results do not depend on it. More than one
-            helps only where cores are idle and the physics is the dearest part of a step.
+            helps only if cores are idle and the physics takes most of the time of a step.
         plant: changes of the plant by name, those of :func:`~torchrl_l1.envs.disturbed_model` and
             ``wind`` of :func:`~torchrl_l1.envs.wind_force`; each a number, one for each
-            environment, or drawn at resets, such as by :class:`~torchrl_l1.envs.Uniform`.
+            environment, or drawn at resets, for example by :class:`~torchrl_l1.envs.Uniform`.
 
     Raises:
         KeyError: if the task is unknown.
-        ValueError: if ``num_envs``, ``max_steps`` or ``threads`` is not positive, or there is no
-            such change of the plant.
+        ValueError: if ``num_envs``, ``max_steps`` or ``threads`` is not positive, or a change of
+            the plant does not exist.
 
     Examples:
         >>> env = BatchedMujocoEnv("inverted_pendulum", num_envs=3, seed=0)
@@ -191,8 +191,8 @@ class BatchedMujocoEnv(CPUEnv):
     def set_simulator_state(self, qpos: np.ndarray, qvel: np.ndarray) -> Tensor:
         """Start a new episode in every environment from a given simulator state.
 
-        For comparisons and rendering. Transforms are not told: those that keep a state of their
-        own (a step counter, a controller) need an ordinary reset first.
+        For comparisons and rendering. Transforms are not notified: those with a state (a step
+        counter, a controller) need an ordinary reset first.
 
         Args:
             qpos: positions ``(N, nq)``.

@@ -1,4 +1,4 @@
-"""What a real environment does that the model is not told: noise and disturbances."""
+"""Noise and disturbances: effects of a real environment that the model is not told about."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ class _UniformNoise(EnvironmentTransform):
 class ActionNoise(_UniformNoise):
     r"""Noise :math:`\xi \sim U(-w, w)` on the action, independent per entry and step.
 
-    The action in the rollout stays noise-free: only what travels on to the base environment
+    The action in the rollout stays noise-free; only the action passed on to the base environment
     changes. The sum is not clipped again (MuJoCo clamps limited actuators), and the reward's
     control cost sees the noisy action, as in the authors' released code.
 
-    Place it *before* a controller such as ``L1Transform`` in ``Compose``: actions travel from the
+    Place it *before* a controller such as ``L1Transform`` in ``Compose``: actions pass from the
     last transform to the first, so the noise then acts on what the controller sends to the
     actuators.
 
@@ -103,7 +103,7 @@ class ActionNoise(_UniformNoise):
 class ObservationNoise(_UniformNoise):
     r"""Noise :math:`U(-w, w)` on the observation after a step, independent per entry and step.
 
-    The observation of a reset stays clean; reward and termination were computed from the clean
+    The observation of a reset stays clean; reward and termination are computed from the clean
     state. Everything downstream (policy, L1, data set) sees the noisy observation. All of this is
     as in the authors' released code.
 
@@ -128,7 +128,7 @@ class ObservationNoise(_UniformNoise):
         return next_tensordict.set(self.key, where_stepped(tensordict, self.key, noisy))
 
 
-# Key of the metadata of a field.
+# Metadata key of a field.
 _DISTURBANCE = "disturbance"
 
 SUITES = ("quick", "full")
@@ -141,16 +141,16 @@ class Disturbance:
 
     Attributes:
         setting: key of ``perturbation`` in recipes, and argument of :func:`make_env`.
-        name: option of ``torchrl-l1 evaluate``, key of a campaign's evaluations, column of
-            their tables, and argument of :func:`make_env` as well.
-        transform: makes the transform that applies a value of it; ``None`` if it acts on the
-            plant, see :func:`disturbed_model`.
+        name: option of ``torchrl-l1 evaluate``, key of a campaign's evaluations, column of their
+            tables, and also an argument of :func:`make_env`.
+        transform: makes the transform that applies a given value; ``None`` if the disturbance acts
+            on the plant, see :func:`disturbed_model`.
         neutral: the value that changes nothing.
-        units: of its values, in words.
-        help: what its values are, in words.
+        units: units of its values, in words.
+        help: description of its values, in words.
         matched: whether an input within the bounds of the actuators could cancel it.
         acts_on: where it enters: ``"action"``, ``"observation"`` or ``"plant"``.
-        levels: by suite, the values that it is tested with.
+        levels: by suite, the values to test.
     """
 
     setting: str
@@ -165,7 +165,7 @@ class Disturbance:
 
     @property
     def words(self) -> str:
-        """Its name in sentences and at axes, such as ``actuator bias``."""
+        """Its name in sentences and on axes, such as ``actuator bias``."""
         return self.setting.replace("_", " ")
 
     @property
@@ -174,11 +174,11 @@ class Disturbance:
         return self.acts_on == "plant"
 
     def begins(self, value: Any) -> int:
-        """The first step of an episode that a value of it disturbs."""
+        """The first step of an episode that a given value disturbs."""
         return 0 if self.transform is None else getattr(self.transform(value), "at", 0)
 
     def check(self, value: float) -> None:
-        """Refuse a value that it cannot have.
+        """Reject a value that it cannot have.
 
         Raises:
             ValueError: naming the value.
@@ -232,11 +232,11 @@ def disturbances_of(settings: type[Perturbation]) -> dict[str, Disturbance]:
 
 @dataclass
 class Perturbation:
-    """What the real environment does that the model is not told.
+    """Effects of a real environment that the model is not told about.
 
     A further disturbance is a :class:`~torchrl.envs.Transform` and a field here: options, keys,
-    columns, tables and figures follow from the field. Of several the first acts first on the
-    action that a controller sends, or on the observation that the environment makes.
+    columns, tables and figures follow from the field. If several are active, the first acts first
+    on the action that a controller sends, or on the observation that the environment makes.
 
     Attributes:
         action_noise: half-width of uniform noise on the executed action, action units.
@@ -247,21 +247,21 @@ class Perturbation:
             and action entry, action units.
         sine_bias: amplitude of a bias with a period of 50 steps, action units.
         step_bias: bias that sets in at the 50th step of an episode, action units.
-        random_walk_bias: standard deviation of what a bias changes in a step, action units.
+        random_walk_bias: standard deviation of a bias's change per step, action units.
         motor_gain: factor on the first entry of the action only.
         dead_zone: width up to which the action does nothing, action units.
         stiction: band within which an actuator holds its output, action units.
-        actuator_delay: steps by which the action comes late.
+        actuator_delay: steps by which the action is delayed.
         sensor_bias: constant added to the observation, raw state units.
-        sensor_delay: steps by which the observation comes late.
-        sensor_dropout: probability that an entry of the observation repeats what was read last.
-        payload: extra mass of the first body that moves, as a fraction of the model's mass.
+        sensor_delay: steps by which the observation is delayed.
+        sensor_dropout: probability that an entry of the observation repeats its last reading.
+        payload: extra mass on the first moving body, as a fraction of the model's mass.
         body_mass: factor on mass and inertia of all bodies.
         contact_friction: factor on the friction of all contacts.
         joint_damping: factor on the damping of all joints.
-        joint_armature: factor on the inertia of the rotors of all joints.
+        joint_armature: factor on the rotor inertia of all joints.
         ground_slope: degrees by which gravity is tilted; uphill is along x.
-        wind_force: force along x on the first body that moves, as a fraction of the weight.
+        wind_force: force along x on the first moving body, as a fraction of the weight.
         contact_softness: factor on the time constant of all contacts.
     """
 
@@ -277,12 +277,12 @@ class Perturbation:
     )  # fmt: skip
     random_signs_bias: float = disturbance(
         "signs", _signs, neutral=0.0, units="action units", matched=True,
-        help="magnitudes of biases of random signs, action units",
+        help="magnitudes of biases with random signs, action units",
         quick=(0.3,), full=(0.1, 0.3, 0.5),
     )  # fmt: skip
     sine_bias: float = disturbance(
         "sine", SineBias, neutral=0.0, units="action units", matched=True,
-        help="amplitudes of a bias that swings, action units", quick=(0.3,), full=(0.1, 0.3, 0.5),
+        help="amplitudes of a sinusoidal bias, action units", quick=(0.3,), full=(0.1, 0.3, 0.5),
     )  # fmt: skip
     step_bias: float = disturbance(
         "step", StepBias, neutral=0.0, units="action units", matched=True,
@@ -290,7 +290,7 @@ class Perturbation:
     )  # fmt: skip
     random_walk_bias: float = disturbance(
         "walk", WalkBias, neutral=0.0, units="action units", matched=True,
-        help="deviations of a step of a bias that walks at random, action units",
+        help="step deviations of a random-walk bias, action units",
         quick=(0.03,), full=(0.01, 0.03, 0.05),
     )  # fmt: skip
     motor_gain: float = disturbance(
@@ -368,7 +368,7 @@ class Perturbation:
 
 
 DISTURBANCES: Mapping[str, Disturbance] = disturbances_of(Perturbation)
-"""By name: what evaluations vary, and training too where a recipe says so."""
+"""Disturbances by name: what evaluations vary, and training too if a recipe says so."""
 
 
 def _differs(value: Any, neutral: float) -> bool:
@@ -376,10 +376,10 @@ def _differs(value: Any, neutral: float) -> bool:
 
 
 def active_disturbances(given: Mapping[str, Any]) -> list[tuple[Disturbance, Any]]:
-    """The disturbances that do something, with their values, in the order of the registry.
+    """The active disturbances with their values, in the order of the registry.
 
     Raises:
-        TypeError: for a disturbance that there is not, or that is given twice.
+        TypeError: for a disturbance that does not exist, or that is given twice.
     """
     known = {entry.setting: entry for entry in DISTURBANCES.values()}
     values: dict[str, Any] = {}
@@ -400,7 +400,7 @@ def active_disturbances(given: Mapping[str, Any]) -> list[tuple[Disturbance, Any
 
 
 def warn_of_late(active: list[tuple[Disturbance, Any]], horizon: float) -> None:
-    """Warn of disturbances that begin when episodes of so many steps are over."""
+    """Warn about disturbances that begin only after the end of episodes of this many steps."""
     for entry, value in active:
         if (begins := entry.begins(value)) >= horizon:
             warnings.warn(
@@ -411,16 +411,16 @@ def warn_of_late(active: list[tuple[Disturbance, Any]], horizon: float) -> None:
 
 
 def disturbance_transforms(**disturbances: Any) -> list[Transform]:
-    """The transforms of disturbances, in the order in which :func:`make_env` has them.
+    """The transforms of disturbances, in the order in which :func:`make_env` uses them.
 
-    They go on any TorchRL environment that has ``action`` and ``observation``, before whatever
-    controls it.
+    Append them to any TorchRL environment that has ``action`` and ``observation``, before its
+    controller.
 
     Args:
-        **disturbances: as of :func:`make_env`; neutral ones are left out.
+        **disturbances: as for :func:`make_env`; neutral ones are left out.
 
     Raises:
-        TypeError: for a disturbance that there is not, or that is given twice.
+        TypeError: for a disturbance that does not exist, or that is given twice.
         ValueError: for a change of the plant, which no transform can make, or a value that a
             disturbance cannot have.
 
@@ -430,20 +430,22 @@ def disturbance_transforms(**disturbances: Any) -> list[Transform]:
     """
     active = active_disturbances(disturbances)
     if plant := plant_values(active):
-        raise ValueError(f"{', '.join(plant)}: a change of the plant is no transform, see make_env")
+        raise ValueError(
+            f"{', '.join(plant)}: a change of the plant is not a transform, see make_env"
+        )
     actuators, sensors = placed_transforms(active)
     return [*actuators, *sensors]
 
 
 def plant_values(active: list[tuple[Disturbance, Any]]) -> dict[str, Any]:
-    """The values of those that change the plant, by name."""
+    """The values of the disturbances that change the plant, by name."""
     return {entry.name: value for entry, value in active if entry.of_plant}
 
 
 def placed_transforms(
     active: list[tuple[Disturbance, Any]],
 ) -> tuple[list[Transform], list[Transform]]:
-    """Transforms of actions and of observations, each such that the registry's first acts first."""
+    """Transforms of actions and of observations, such that the registry's first acts first."""
     placed: dict[str, list[Transform]] = {"action": [], "observation": []}
     for entry, value in active:
         if entry.transform is not None:
@@ -452,16 +454,16 @@ def placed_transforms(
 
 
 def suite(name: str) -> list[dict[str, float]]:
-    """The cells of a suite of disturbances: none first, then each value of each by itself.
+    """The cells of a suite of disturbances: first none, then each value of each on its own.
 
     Args:
         name: one of :data:`SUITES`.
 
     Returns:
-        What :func:`make_env` takes beside the task: ``{disturbance: value}``.
+        Arguments of :func:`make_env` besides the task: ``{disturbance: value}``.
 
     Raises:
-        ValueError: for any other name.
+        ValueError: for an unknown name.
 
     Examples:
         >>> suite("quick")[:3]

@@ -1,8 +1,8 @@
 """Disturbances of the plant: changes of a MuJoCo model, and a force that acts on a body.
 
-A change makes one :class:`mujoco.MjModel` of another, so that the same one disturbs the batched
-environments of this package and any MuJoCo environment of Gymnasium. None counts as matched: what
-a change does to the motion depends on the state, and reaches degrees of freedom without a motor.
+A change turns one :class:`mujoco.MjModel` into another, so it can disturb both the batched
+environments of this package and any MuJoCo environment of Gymnasium. None counts as matched: its
+effect on the motion depends on the state, and reaches degrees of freedom without a motor.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import torch
 from torchrl_l1.envs.disturbances import Draw
 
 PlantValue = float | Sequence[float] | np.ndarray | Draw
-"""A number, one for each environment, or drawn at resets such as by ``Uniform``."""
+"""A number, one for each environment, or drawn at resets, for example by ``Uniform``."""
 
 _GRAVITY = 9.81
 _ANY = slice(None)
@@ -29,7 +29,7 @@ Rows = slice | np.ndarray
 
 
 def _setconst(model: mujoco.MjModel) -> None:
-    # What MuJoCo derives from masses and armatures when it compiles a model.
+    # Quantities that MuJoCo derives from masses and armatures when it compiles a model.
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
@@ -37,7 +37,7 @@ def _payload(model: mujoco.MjModel, fraction: float, body: int | None) -> None:
     row = _first_body(model) if body is None else body
     before, added = float(model.body_mass[row]), fraction * float(model.body_mass.sum())
     if before and (model.opt.density or model.opt.viscosity):
-        # MuJoCo takes the shape that a fluid flows around from the ratio of inertia and mass.
+        # MuJoCo derives the shape around which a fluid flows from the ratio of inertia and mass.
         model.body_inertia[row] *= (before + added) / before
     model.body_mass[row] = before + added
     _setconst(model)
@@ -89,13 +89,13 @@ def _softness(model: mujoco.MjModel, factor: float, body: int | None) -> None:
     for references in (model.geom_solref, model.pair_solref):
         rows = _geoms(model, body) if references is model.geom_solref else _pairs(model, body)
         chosen = references[rows]
-        # Either (time constant, damping ratio), or minus (stiffness, damping).
+        # Either (time constant, damping ratio), or the negatives of (stiffness, damping).
         timed = chosen[:, :1] > 0
         references[rows] = np.where(timed, chosen * [factor, 1.0], chosen / [factor**2, factor])
 
 
 class _Change(NamedTuple):
-    """How a value changes a model, which values there are, and what must be there to be changed."""
+    """How a value changes a model, which values are allowed, and what the model must contain."""
 
     apply: Callable[[mujoco.MjModel, float, int | None], None]
     neutral: float
@@ -126,7 +126,7 @@ _NAMES = (*_CHANGES, _WIND)
 
 
 def check_plant(name: str, value: float) -> None:
-    """Refuse a disturbance of the plant that there is not, or a value that it cannot have.
+    """Reject an unknown disturbance of the plant, or a value that it cannot have.
 
     Raises:
         ValueError: naming both.
@@ -140,12 +140,12 @@ def check_plant(name: str, value: float) -> None:
 
 
 def survives_resets(name: str) -> bool:
-    """Whether a change outlasts Gymnasium's resets, which take the force of a wind away."""
+    """Whether a change survives Gymnasium's resets, which clear the force of a wind."""
     return name != _WIND
 
 
 def cannot_change(environment: str, name: str) -> str:
-    """What to say of a change of the plant that an environment of elsewhere cannot be given."""
+    """The error for a change of the plant that an environment from elsewhere cannot be given."""
     others = "" if name == _WIND else " or one of Gymnasium's MuJoCo environments"
     return (
         f"{name} changes the plant, which needs a task of ours{others}, not {environment}: leave "
@@ -173,20 +173,21 @@ def disturbed_model(
     softness time constant of all contacts                   factor
     ======== =============================================== ==============================
 
-    They are made in this order, and one that does nothing (friction where nothing can touch) gets a
-    warning. None of them is matched. Damping and armature come nearest: where
-    only joints with motors have any, the change acts like an input, though one that depends on
-    velocity and acceleration.
+    They are applied in this order, and one without any effect (friction where nothing can touch)
+    causes a warning. None of them is matched. Damping and armature come closest: if only joints
+    with motors have any, the change acts like an input, though one that depends on velocity and
+    acceleration.
 
     Args:
-        model: the model; it stays as it is.
-        changes: value of each change, by name; 1 changes nothing where it is a factor, else 0.
-        body: by name or number, to change only this body, its geoms or its joints.
+        model: the model, which is not modified.
+        changes: value of each change, by name; a factor of 1 changes nothing, nor does 0 for the
+            others.
+        body: name or number of a body, to change only it, its geoms or its joints.
 
     Raises:
-        ValueError: if there is no such change, value or body; if the friction of a body alone is
-            changed whose contacts have that of what it touches; a wind is a force and no part of a
-            model, see :func:`wind_force`.
+        ValueError: if there is no such change, value or body; if the friction of a single body is
+            changed although its contacts take that of what it touches; for a wind, which is a force
+            and not part of a model, see :func:`wind_force`.
 
     Examples:
         >>> from torchrl_l1.envs import get_task
@@ -217,12 +218,12 @@ def disturbed_model(
 
 
 def does_nothing(model: mujoco.MjModel, name: str, value: float) -> bool:
-    """Whether a change leaves the motion of a model as it is, as friction where nothing touches.
+    """Whether a change does not affect a model's motion, like friction where nothing touches.
 
     Args:
-        model: the model; it stays as it is.
-        name: of the change.
-        value: of the change.
+        model: the model, which is not modified.
+        name: name of the change.
+        value: value of the change.
     """
     if name == _WIND:
         return False
@@ -232,15 +233,15 @@ def does_nothing(model: mujoco.MjModel, name: str, value: float) -> bool:
 
 
 def wind_force(model: mujoco.MjModel, value: float, body: str | int | None = None) -> np.ndarray:
-    """A force along x on a body, for ``xfrc_applied`` of an ``MjData``, which resets clear.
+    """A force along x on a body, for ``xfrc_applied`` of an ``MjData``; resets clear it.
 
-    Not matched for most: it acts at the body, not at a motor. (On the cart of a pendulum it is.)
+    Generally not matched: it acts on the body, not on a motor. (On the cart of a pendulum it is.)
 
     Args:
-        model: the model, as it is before other changes.
-        value: the force, as a fraction of the weight of all its bodies at 9.81 m/s^2.
-        body: by name or number; the first that moves if ``None``. The force acts at its centre of
-            mass.
+        model: the model before any other changes.
+        value: the force, as a fraction of the weight of all the model's bodies at 9.81 m/s^2.
+        body: name or number of a body; the first moving one if ``None``. The force acts at its
+            centre of mass.
 
     Returns:
         Forces and torques ``(nbody, 6)``, newtons and newton metres.
@@ -288,7 +289,7 @@ def _pairs(model: mujoco.MjModel, body: int | None) -> Rows:
 
 
 def _touching(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of geoms that MuJoCo lets touch each other, whatever a model says of single pairs."""
+    """Pairs of geoms that MuJoCo lets touch each other, apart from a model's explicit pairs."""
     first, second = np.triu_indices(model.ngeom, 1)
     kind, with_ = model.geom_contype, model.geom_conaffinity
     meet = (kind[first] & with_[second] | kind[second] & with_[first]) != 0
@@ -309,7 +310,7 @@ def _contact_friction(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _felt(model: mujoco.MjModel) -> np.ndarray:
-    """What the changes reach, as far as the motion feels it."""
+    """The quantities that the changes affect, as far as they affect the motion."""
     references = np.vstack([model.geom_solref[np.union1d(*_touching(model))], model.pair_solref])
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
         # No contact is harder than this.
@@ -327,18 +328,19 @@ class Plant:
     """Changes of a model, with a value for each of several environments.
 
     Args:
-        model: the model that is changed; it stays as it is.
+        model: the model, which is not modified.
         num_envs: number of environments ``N``.
-        changes: by name, see :func:`disturbed_model`; and ``wind``, see :func:`wind_force`. Each a
-            number, one for each environment, or drawn at resets.
-        body: the body that all of them act on.
+        changes: by name, see :func:`disturbed_model`; also ``wind``, see :func:`wind_force`. Each
+            is a number, one for each environment, or drawn at resets.
+        body: the body on which all of them act.
 
     Attributes:
-        values: by name, ``(N,)`` float64.
+        values: values by name, ``(N,)`` float64.
         is_drawn: whether any are drawn at resets.
 
     Raises:
-        ValueError: if there is no such change, value or body, or not one for each environment.
+        ValueError: if there is no such change, value or body, or not one value for each
+            environment.
     """
 
     def __init__(
@@ -371,7 +373,7 @@ class Plant:
                 check_plant(name, float(value))
 
     def redraw(self, indices: np.ndarray) -> None:
-        """Draw anew what is drawn, for some environments, from torch's global generator."""
+        """Redraw drawn values, for some environments, from torch's global generator."""
         for name in self._draws:
             self.values[name][indices] = self._drawn(name, len(indices))
         self._check()
@@ -392,7 +394,7 @@ class Plant:
         return found
 
     def forces(self) -> np.ndarray | None:
-        """What acts on the bodies ``(N, nbody, 6)``, if there is wind."""
+        """Forces on the bodies ``(N, nbody, 6)``, if there is wind."""
         if _WIND not in self.values:
             return None
         return np.stack([wind_force(self._model, float(v), self._body) for v in self.values[_WIND]])

@@ -1,4 +1,4 @@
-"""Names of what users bring along: ``MODULE:NAME`` and ``FILE.py:NAME``."""
+"""Names of objects that users supply: ``MODULE:NAME`` and ``FILE.py:NAME``."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ import gymnasium
 
 
 def require(module: str, extra: str) -> ModuleType:
-    """Import a package that is not needed by all.
+    """Import an optional package.
 
     Raises:
-        ValueError: if it is not there, with the extra that brings it.
+        ValueError: if it is not installed, naming the extra that provides it.
     """
     try:
         return import_module(module)
@@ -32,10 +32,10 @@ def require(module: str, extra: str) -> ModuleType:
 
 @contextmanager
 def making(name: str) -> Iterator[None]:
-    """Say in a line that a package is missing, without which Gymnasium makes no environment.
+    """Report in one line that a package is missing that Gymnasium needs for an environment.
 
     Raises:
-        ValueError: with the name of the environment and what Gymnasium says.
+        ValueError: with the name of the environment and Gymnasium's message.
     """
     try:
         yield
@@ -44,15 +44,15 @@ def making(name: str) -> Iterator[None]:
 
 
 def load_attribute(name: str, search_path: Sequence[str | Path] = ()) -> Any:
-    """What ``MODULE:NAME`` or ``FILE.py:NAME`` names.
+    """The object that ``MODULE:NAME`` or ``FILE.py:NAME`` names.
 
     Args:
         name: such as ``my_package.envs:make_env`` or ``envs.py:make_env``.
-        search_path: folders in which files are looked for, and modules that Python's own path does
-            not have; after them, the working directory.
+        search_path: folders in which to look for files, and for modules that are not on Python's
+            own path; the working directory comes after them.
 
     Raises:
-        ValueError: if there is none.
+        ValueError: if it does not exist.
 
     Examples:
         >>> load_attribute("math:hypot")(3, 4)
@@ -66,16 +66,16 @@ def load_attribute(name: str, search_path: Sequence[str | Path] = ()) -> Any:
 
 
 def find_attribute(name: str, search_path: Sequence[str | Path] = ()) -> Any:
-    """As :func:`load_attribute`; ``None`` where there is the module, but not the name in it."""
+    """As :func:`load_attribute`; ``None`` if the module exists, but not the name in it."""
     module, _, attribute = name.rpartition(":")
     return getattr(load_module(module, search_path), attribute, None)
 
 
 def load_module(name: str, search_path: Sequence[str | Path] = ()) -> ModuleType:
-    """A module, by its name or its file.
+    """A module, by its name or file.
 
     Raises:
-        ValueError: if it is not there, or cannot be imported.
+        ValueError: if it does not exist, or cannot be imported.
     """
     if name.endswith(".py"):
         file = next((place for place in _places(name, search_path) if place.is_file()), None)
@@ -95,9 +95,9 @@ def load_module(name: str, search_path: Sequence[str | Path] = ()) -> ModuleType
 
 
 def folders_of(names: Iterable[str], folders: Iterable[Path]) -> list[str]:
-    """Those folders that hold what one of these names begins with.
+    """The folders that contain what one of these names begins with.
 
-    A name that begins with a package of Python's own path needs no folder.
+    A name that begins with a package on Python's own path needs no folder.
 
     Args:
         names: such as ``envs.py:make_env``, ``my_package:MyEnv-v0`` or ``gymnasium/Reacher-v5``.
@@ -117,7 +117,7 @@ def folders_of(names: Iterable[str], folders: Iterable[Path]) -> list[str]:
 
 
 def same_code(names: Iterable[str], one: Sequence[str | Path], other: Sequence[str | Path]) -> bool:
-    """Whether names mean the same along two search paths, as far as their files can be found.
+    """Whether names mean the same on two search paths, as far as their files can be found.
 
     Args:
         names: such as ``envs.py:make_env`` or ``my_package:MyEnv-v0``.
@@ -132,11 +132,11 @@ def same_code(names: Iterable[str], one: Sequence[str | Path], other: Sequence[s
 
 
 def code_digests(names: Iterable[str], folders: Sequence[str | Path]) -> dict[str, str]:
-    """Digests of the files and modules that names begin with, as far as they can be found.
+    """Digests of the files and modules with which names begin, as far as they can be found.
 
     Args:
         names: such as ``envs.py:make_env`` or ``my_package:MyEnv-v0``.
-        folders: where to look; after them, the working directory.
+        folders: where to look; the working directory comes after them.
     """
     found = {}
     for module in dict.fromkeys(name.rpartition(":")[0] for name in names):
@@ -147,7 +147,7 @@ def code_digests(names: Iterable[str], folders: Sequence[str | Path]) -> dict[st
 
 
 def file_digest(file: Path) -> str:
-    """The first digits of a file's SHA-256; it is read again where its time or size is another."""
+    """The first digits of a file's SHA-256; read again if its time or size has changed."""
     about = file.stat()
     return _digest(file.resolve(), about.st_mtime_ns, about.st_size)
 
@@ -159,7 +159,7 @@ def _digest(file: Path, changed: int, size: int) -> str:
 
 
 def _file_of(module: str, folders: Sequence[str | Path]) -> Path | None:
-    """The first file of a module or of this name in some folders."""
+    """The first file of a module or of this name in the given folders."""
     name = module if module.endswith(".py") else module.replace(".", "/")
     endings = ("",) if module.endswith(".py") else (".py", "/__init__.py")
     places = (Path(folder, name + ending) for folder in folders for ending in endings if module)
@@ -192,11 +192,11 @@ def _holds(folder: Path, package: str) -> bool:
 
 @cache
 def _of_file(file: Path, changed: int) -> ModuleType:
-    """Loaded once, and again where it has changed."""
+    """Loaded once, and again after it has changed."""
     spec = importlib.util.spec_from_file_location(file.stem, file)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    # As of an import: what the file defines may look its own module up.
+    # As in an import: code in the file may look up its own module.
     is_ours = sys.modules.setdefault(file.stem, module) is module
     try:
         spec.loader.exec_module(module)

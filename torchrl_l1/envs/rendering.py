@@ -58,17 +58,17 @@ def _decorated(task: Task) -> mujoco.MjModel:
 def rollout_frames(
     task: str | Task, qpos: np.ndarray, *, size: tuple[int, int] = (240, 180)
 ) -> list[np.ndarray]:
-    """Draw the poses of a rollout, in a process of its own.
+    """Draw the poses of a rollout in a separate process.
 
     The poses can be recorded with ``rollout``'s callback:
     ``env.rollout(100, policy, callback=lambda env, _: poses.append(env.simulator_state()[0][0]))``.
 
-    The backend is the one named by ``MUJOCO_GL``, or else the first that works of EGL, OSMesa and
-    (with a display) GLFW.
+    The backend is the one named by ``MUJOCO_GL``, or else the first of EGL, OSMesa and (with a
+    display) GLFW that works.
 
     Args:
         task: a key of :data:`~torchrl_l1.envs.TASKS`, or a :class:`~torchrl_l1.envs.Task`.
-        qpos: simulator positions ``(T, nq)``; velocities do not show.
+        qpos: simulator positions ``(T, nq)``; velocities are not drawn.
         size: width and height of a frame in pixels.
 
     Returns:
@@ -76,7 +76,7 @@ def rollout_frames(
 
     Raises:
         ValueError: if ``qpos`` has the wrong shape.
-        RenderingUnavailable: if no backend works; the message says what each of them reported.
+        RenderingUnavailable: if no backend works; the message contains the error of each.
     """
     return draw_poses(_decorated(built_in_task(task)), qpos, size=size)
 
@@ -84,7 +84,7 @@ def rollout_frames(
 def draw_poses(
     model: mujoco.MjModel, qpos: np.ndarray, *, size: tuple[int, int] = (240, 180)
 ) -> list[np.ndarray]:
-    """As :func:`rollout_frames`, of any MuJoCo model."""
+    """As :func:`rollout_frames`, for any MuJoCo model."""
     if np.ndim(qpos) != 2 or np.shape(qpos)[1] != model.nq:
         raise ValueError(f"qpos has shape {np.shape(qpos)}, expected (T, {model.nq})")
     reports = []
@@ -95,7 +95,7 @@ def draw_poses(
         command = [sys.executable, str(_WORKER), arrays, binary, output]
         for backend in _backends():
             environment = {**os.environ, "MUJOCO_GL": backend}
-            # PyOpenGL insists on a platform that fits the backend.
+            # PyOpenGL insists on a platform that matches the backend.
             environment.pop("PYOPENGL_PLATFORM", None)
             try:
                 subprocess.run(
@@ -143,8 +143,8 @@ def filmstrip(
     Args:
         rows: frames ``(height, width, 3)`` of each rollout, by the label to print beside them.
         path: the PNG file to write; its folder is created.
-        every: shows every so many-th frame, the first included.
-        dt: duration of one step in seconds; if given, the columns carry their time.
+        every: shows every n-th frame, starting with the first.
+        dt: duration of one step in seconds; if given, it labels the columns with their times.
 
     Returns:
         The path.
@@ -186,13 +186,13 @@ def animation(
 ) -> Path:
     """Write a looping GIF with the rollouts one below the other, in real time.
 
-    A rollout that is shorter than the others holds its last frame.
+    A rollout shorter than the others holds its last frame.
 
     Args:
         rows: frames ``(height, width, 3)`` of each rollout, by the label to print on them.
         path: the GIF file to write; its folder is created.
-        every: shows every so many-th frame, the first included.
-        dt: duration of one step in seconds; of short ones not every frame is shown.
+        every: shows every n-th frame, starting with the first.
+        dt: duration of one step in seconds; if it is short, some frames are skipped.
 
     Returns:
         The path.
@@ -219,12 +219,12 @@ def animation(
 
 
 def gif_frames(count: int, dt: float) -> tuple[list[int], int]:
-    """Which frames a GIF shows to be in real time, and how long each, ms.
+    """Which frames a real-time GIF shows, and how long each, ms.
 
-    Times are multiples of 10 ms in the format, and players slow down what is below 20.
+    The format stores times in multiples of 10 ms, and players slow down frames below 20 ms.
 
     Args:
-        count: of all frames.
+        count: number of all frames.
         dt: time between them, s.
 
     Examples:
@@ -244,8 +244,8 @@ def write_gif(images: Sequence[Image.Image], duration: int, file: IO[bytes]) -> 
 
     Args:
         images: the pictures.
-        duration: of each, ms.
-        file: open for writing.
+        duration: duration of each, ms.
+        file: a file open for writing.
     """
     first, *others = images
     first.save(file, "GIF", save_all=True, append_images=others, duration=duration, loop=0)

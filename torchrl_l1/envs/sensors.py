@@ -1,8 +1,8 @@
 """Disturbances of the observation on its way from the sensors.
 
-They are transforms for any TorchRL environment, batched or not, with a state of their own for
-every environment, which a reset renews for those that it resets. None is matched: no input changes
-what a sensor reads wrongly. Reward and termination come from the clean state.
+They are transforms for any TorchRL environment, batched or not. Each keeps a separate state for
+every environment, which a reset of that environment renews. None is matched: no input changes a
+sensor's error. Reward and termination come from the clean state.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from torchrl_l1.envs.disturbances import DelayLine, HeldDisturbance, Value, wher
 
 
 class _Sensor(HeldDisturbance):
-    """A map of the observation, those of resets included."""
+    """A transform of the observation, including that of resets."""
 
     reason = "it must enter the data once, while they are collected"
     what = disturbs = "observation"
     matched = False
 
     def _first(self, reading: Tensor) -> Tensor:
-        """What is read at a reset."""
+        """The reading at a reset."""
         return reading
 
     def _read(self, reading: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """What is read after a step, and the state then."""
+        """The reading after a step, and the new state."""
         raise NotImplementedError
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -50,13 +50,13 @@ class _Sensor(HeldDisturbance):
         self.check_order(bool(self._state))
         seen = self._first(reading)
         if reset is not None:
-            # The others' entries are those that they had, disturbed already.
+            # The others keep their previous entries, which are disturbed already.
             seen = torch.where(reset, seen, reading)
         return tensordict_reset.set(self.key, seen)
 
 
 class SensorBias(_Sensor):
-    """A constant on top of every observation.
+    """A constant added to every observation.
 
     Not matched.
 
@@ -86,12 +86,12 @@ class SensorBias(_Sensor):
 
 
 class SensorDelay(DelayLine, _Sensor):
-    """The observation of some steps ago; that of the reset before there was one.
+    """The observation from some steps ago; that of the reset before there was one.
 
     Not matched.
 
     Args:
-        steps: whole number; one, one for each entry, one row for each environment, or drawn at
+        steps: a whole number; one, one for each entry, one row for each environment, or drawn at
             resets and rounded down.
         observation_key: key of the observation.
 
@@ -110,17 +110,18 @@ class SensorDelay(DelayLine, _Sensor):
 
 
 class SensorDropout(_Sensor):
-    """Readings are lost at random; what was read last stands in for them.
+    """Readings are lost at random and replaced by the last reading.
 
     Not matched. Draws come from torch's global generator.
 
     Args:
-        probability: of each entry at each step, in ``[0, 1]``; as of :class:`SensorBias`.
-        whole: whether the entries of an observation are lost together.
+        probability: probability for each entry at each step, in ``[0, 1]``; as for
+            :class:`SensorBias`.
+        whole: whether all entries of an observation are lost together.
         observation_key: key of the observation.
 
     Raises:
-        ValueError: if the probability is none.
+        ValueError: if the probability is not between 0 and 1.
     """
 
     def __init__(
@@ -134,7 +135,7 @@ class SensorDropout(_Sensor):
 
     def _check(self, value: Tensor) -> None:
         inside = (value >= 0) & (value <= 1)
-        self._require(bool(inside.all()), "a probability is between 0 and 1", value)
+        self._require(bool(inside.all()), "a probability must be between 0 and 1", value)
 
     def _begin(self, entry: Tensor) -> dict[str, Tensor]:
         return {"last": entry.clone()}

@@ -1,4 +1,4 @@
-"""Batched MuJoCo simulation of a task, and the states that episodes start from."""
+"""Batched MuJoCo simulation of a task, and the states in which episodes start."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from torchrl_l1.envs.plant import Plant, PlantValue
 from torchrl_l1.envs.task import BadAction, Task
 from torchrl_l1.envs.tasks import built_in_task
 
-# Beyond this magnitude MuJoCo itself calls a number bad (mjMAXVAL).
+# Beyond this magnitude MuJoCo itself considers a number bad (mjMAXVAL).
 MAX_MAGNITUDE = 1e10
-# Observations and rewards are kept in single precision, where larger ones are infinite.
+# Observations and rewards are kept in single precision, in which larger ones are infinite.
 LARGEST = float(np.finfo(np.float32).max)
 _BAD_STATE = [
     int(mujoco.mjtWarning.mjWARN_BADQPOS),
@@ -28,9 +28,9 @@ _NO_STAGE = int(mujoco.mjtStage.mjSTAGE_NONE)
 
 
 def turned_bad(data: mujoco.MjData) -> bool:
-    """Whether a single simulation has turned bad since this was asked last.
+    """Whether a single simulation has become unstable since the last call.
 
-    Its warnings of bad states are cleared, since MuJoCo counts from the restart that each makes.
+    It clears MuJoCo's warnings of bad states, since each restart resets its counts.
     """
     counts = data.warning.number
     warned = counts.any() and counts[_BAD_STATE].any()
@@ -43,8 +43,9 @@ def turned_bad(data: mujoco.MjData) -> bool:
 class BatchedSimulator:
     """``num_envs`` simulations of one task.
 
-    Each keeps its whole integration state from step to step, solver warm start included, so that
-    trajectories are bit-equal to Gymnasium's. Copies and pickles continue where the original is.
+    Each keeps its whole integration state from step to step, solver warm start included, so
+    trajectories are bit-identical to Gymnasium's. Copies and pickles continue from the original's
+    state.
 
     Args:
         task: the task to simulate.
@@ -54,7 +55,7 @@ class BatchedSimulator:
 
     Attributes:
         model: the compiled MuJoCo model, without changes of the plant.
-        plant: the changes, if there are any.
+        plant: the changes of the plant, if any.
         batch: MuJoCo's own interface to all simulations (contacts, sensors, body poses, ...).
         qpos: positions ``(N, nq)``, float64; a live view.
         qvel: velocities ``(N, nv)``, float64; a live view.
@@ -77,7 +78,7 @@ class BatchedSimulator:
     def _start(self) -> None:
         try:
             self.batch = Batch(self.model, self.num_envs, nthread=self.threads)
-        # As MuJoCo says it, by their number.
+        # MuJoCo's warnings by their numbers.
         except (MemoryError, TypeError, ValueError) as error:
             if isinstance(error, TypeError) and self.num_envs < 2**31:
                 raise
@@ -109,7 +110,7 @@ class BatchedSimulator:
         Args:
             qpos: positions ``(K, nq)``.
             qvel: velocities ``(K, nv)``.
-            indices: the ``K`` environments meant; all ``N`` by default.
+            indices: the ``K`` environments; all ``N`` by default.
 
         Raises:
             ValueError: if a shape is not the expected one or a number is not finite.
@@ -144,23 +145,23 @@ class BatchedSimulator:
     def step(self, control: np.ndarray, indices: np.ndarray | None = None) -> np.ndarray:
         """Advance environments by one environment step.
 
-        Where the simulation turns bad (MuJoCo's warnings of a bad position, velocity or
-        acceleration, upon which it silently restarts from the XML's pose), the environment is put
-        back to the state before the step.
+        If a simulation becomes unstable (MuJoCo warns of a bad position, velocity or acceleration
+        and silently restarts from the XML's pose), the environment is returned to its state before
+        the step.
 
         Args:
             control: actuator inputs ``(N, m)``, float64; MuJoCo clamps them where the XML says so.
-            indices: the environments meant; all ``N`` by default.
+            indices: the environments; all ``N`` by default.
 
         Returns:
-            Boolean ``(N,)``: which environments turned bad.
+            Boolean ``(N,)``: the environments that became unstable.
         """
         batch = self.batch
         before = batch.state.copy()
         self._ctrl[:] = control
         batch.step(indices, nstep=self.task.frame_skip)
-        # MuJoCo checks at the start of a step: what the last one produced is unchecked. A maximum
-        # is NaN as soon as one entry is, and fails the comparison as well.
+        # MuJoCo checks at the start of a step, so the result of the last one is unchecked. A
+        # maximum is NaN as soon as one entry is, and then also fails the comparison.
         sound = np.abs(self.qpos).max() <= MAX_MAGNITUDE >= np.abs(self.qvel).max()
         if sound and not batch.warning.any():
             return np.zeros(self.num_envs, dtype=bool)
@@ -177,7 +178,8 @@ class BatchedSimulator:
 class StartStates:
     """Clean initial observations of a task, drawn without stepping any physics.
 
-    Randomness follows torch's global generator, like the rest of an imagined rollout.
+    Random numbers come from torch's global generator, like those of the rest of an imagined
+    rollout.
 
     Args:
         task: a key of :data:`~torchrl_l1.envs.TASKS`, or a :class:`~torchrl_l1.envs.Task`.
@@ -209,7 +211,7 @@ class TaskStep(NamedTuple):
 
 
 class TaskSimulation:
-    """A task in ``num_envs`` simulations, without horizon, noise or random generator of its own.
+    """A task in ``num_envs`` simulations, without a horizon, noise or random generator.
 
     Args:
         task: the task.
@@ -219,11 +221,11 @@ class TaskSimulation:
 
     Attributes:
         simulator: the physics.
-        observation: clean observations ``(N, n)``, float64. Every reset and step puts a new tensor
-            here; the old one is never written to.
+        observation: clean observations ``(N, n)``, float64. Every reset and step replaces this
+            tensor; the old one is never written to.
 
     Raises:
-        ValueError: if a function of the task returns another shape than it should.
+        ValueError: if a function of the task returns a wrong shape.
     """
 
     def __init__(
@@ -258,7 +260,7 @@ class TaskSimulation:
 
     def _observe(self, previous_qpos: np.ndarray) -> Tensor:
         simulator = self.simulator
-        # A copy: a task of a user may return the live positions themselves.
+        # A copy: a user's task may return the live positions themselves.
         return torch.tensor(self.task.observe(simulator.qpos, simulator.qvel, previous_qpos))
 
     def reset(self, rng: np.random.Generator, indices: np.ndarray) -> None:
@@ -286,13 +288,13 @@ class TaskSimulation:
     def step(self, action: Tensor, stepped: Tensor | None = None) -> TaskStep:
         """Advance environments by one environment step.
 
-        An environment whose simulation turns bad keeps its state and its observation. One whose
-        task makes an observation or reward of it that is not finite keeps its observation.
+        An environment whose simulation becomes unstable keeps its state and its observation. One
+        whose observation or reward is not finite keeps its observation.
 
         Args:
             action: ``(N, m)``; MuJoCo clamps it where the XML says so.
-            stepped: which environments take the step ``(N,)``, bool; all if ``None``. The others
-                stay as they are, whatever their action is.
+            stepped: the environments that take the step ``(N,)``, bool; all if ``None``. The others
+                stay as they are, whatever their action.
 
         Raises:
             ValueError: if the shape is wrong, or an entry is not finite or beyond 1e10.

@@ -1,4 +1,4 @@
-"""Single environments of elsewhere, whatever library they come from, NumPy in and NumPy out."""
+"""Single environments from elsewhere, whatever their library, with NumPy inputs and outputs."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ from torchrl_l1.envs.vectors import (
 )
 
 PAGE = "see the page on environments"
-"""Where the forms of environments are explained."""
+"""Where the kinds of environments are explained."""
 
 
 class SingleEnv(Protocol):
-    """One environment, every reset of which has a seed of its own.
+    """One environment, each reset of which has its own seed.
 
     Attributes:
         low: lower bounds of the action ``(m,)``.
-        high: upper bounds.
+        high: upper bounds of the action.
         observation_dim: width of the observation.
     """
 
@@ -53,29 +53,29 @@ class SingleEnv(Protocol):
         """Start an episode; the observation ``(n,)``, float32."""
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
-        """Observation ``(n,)``, reward, and whether the episode has terminated or is truncated."""
+        """Observation ``(n,)``, reward, and whether the episode was terminated or truncated."""
 
     def time_step(self) -> float | None:
-        """Seconds of a step, as far as the environment tells."""
+        """Seconds per step, if the environment declares it."""
 
     def horizon(self) -> int | None:
-        """Steps of an episode, as far as the environment tells."""
+        """Steps per episode, if the environment declares it."""
 
     def simulation(self) -> Any:
-        """What has MuJoCo's ``model`` and ``data``, where it is one of Gymnasium's."""
+        """The object with MuJoCo's ``model`` and ``data``, if the environment is Gymnasium's."""
 
     def innermost(self) -> Any:
-        """The environment, without what is around it."""
+        """The environment without wrappers."""
 
     def outcome(self) -> Outcome | None:
-        """Reward and termination as functions of the observation, where they are known."""
+        """Reward and termination as functions of the observation, if they are known."""
 
     def close(self) -> None:
-        """Free what it holds."""
+        """Close the environment."""
 
 
 class _Single:
-    """What both have in common; deep copies continue where the original is, with its plant."""
+    """Code common to both; deep copies continue from the original's state, with its plant."""
 
     env: Any
 
@@ -98,11 +98,11 @@ class _Single:
 
     def __getstate__(self) -> dict[str, Any]:
         if self._made_anew():
-            raise TypeError(self._cannot_be("pickled", "gymnasium.utils.EzPickle makes it anew"))
+            raise TypeError(self._cannot_be("pickled", "gymnasium.utils.EzPickle recreates it"))
         return self.__dict__
 
     def _made_anew(self) -> list[Any]:
-        """Environment and wrappers that usual copies leave without their state, inmost first."""
+        """Environment and wrappers whose state ordinary copies would lose, innermost first."""
         layer = wrapped(self.env)
         found: list[Any] = []
         while isinstance(layer, gymnasium.Env):
@@ -117,12 +117,12 @@ class _Single:
 
 
 class SingleGymnasiumEnv(_Single):
-    """An environment of Gymnasium, without TorchRL between."""
+    """An environment of Gymnasium, without TorchRL in between."""
 
     def __init__(
         self, env: gymnasium.Env[Any, Any] | GymWrapper, name: str, keys: Sequence[str]
     ) -> None:
-        # A wrapper that is let go closes what is in it.
+        # Releasing a wrapper closes the environment inside.
         self._owner, self._name, self._keys = env, name, tuple(keys)
         self.env: gymnasium.Env[Any, Any] = env._env if isinstance(env, GymWrapper) else env
         space = self.env.action_space
@@ -143,8 +143,8 @@ class SingleGymnasiumEnv(_Single):
                 raise ValueError(
                     f"{name} has {'images or tables' if images else space} as observations; a "
                     "vector of floating-point numbers is needed, which "
-                    "gymnasium.wrappers.FlattenObservation makes of tables and DtypeObservation of "
-                    f"whole numbers ({PAGE})"
+                    "gymnasium.wrappers.FlattenObservation makes from tables and "
+                    f"DtypeObservation from whole numbers ({PAGE})"
                 )
             return int(space.shape[0])
         parts = {key: part for key, part in space.spaces.items() if _is_vector(part)}
@@ -169,7 +169,7 @@ class SingleGymnasiumEnv(_Single):
         return self._observed(self._parts("reset", self.env.reset(seed=seed), 2)[0])
 
     def _parts(self, method: str, returned: Any, count: int) -> tuple[Any, ...]:
-        """What a method returned, which has another form in Gym's old interface."""
+        """The result of a method, which has another form in Gym's old interface."""
         if not isinstance(returned, tuple) or len(returned) != count:
             form = {2: "observation, info", 5: "observation, reward, terminated, truncated, info"}
             raise ValueError(
@@ -211,7 +211,7 @@ class SingleTorchRLEnv(_Single):
         if tuple(env.batch_size) not in ((), (1,)):
             raise ValueError(
                 f"{name} is a batch of {tuple(env.batch_size)} environments; let it return a "
-                "single one, which is made as often as it is needed"
+                "single one, which is created as often as needed"
             )
         self._name = name
         parts = vectors(env)
@@ -232,7 +232,7 @@ class SingleTorchRLEnv(_Single):
 
     def reset(self, seed: int) -> np.ndarray:
         """See :class:`SingleEnv`."""
-        # Some draw from torch's global generator; what a policy draws must not start anew.
+        # Some draw from torch's global generator; a policy's draws must not start over.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.env.set_seed(seed)
@@ -267,7 +267,7 @@ class SingleTorchRLEnv(_Single):
         frames = 1
         while isinstance(env, TransformedEnv):
             chain = list(env.transform.modules())
-            # They count what they are asked for, however many frames that is.
+            # They count the frames requested, however many a step takes.
             limits += [t.max_steps for t in chain if isinstance(t, StepCounter)]
             frames *= math.prod(t.frame_skip for t in chain if isinstance(t, FrameSkipTransform))
             env = env.base_env
@@ -294,7 +294,7 @@ class SingleTorchRLEnv(_Single):
 
 
 def _number(name: str, reward: Any) -> float:
-    """A reward, which some give as an array with one number."""
+    """A reward, which some environments return as an array with one number."""
     earned = np.asarray(reward, dtype=np.float64)
     if earned.size != 1:
         raise ValueError(
@@ -316,12 +316,12 @@ def _is_limit(limit: object) -> bool:
 
 
 def _in_steps(limit: Any, frames: int) -> int | None:
-    """A limit in frames, of which a step takes several."""
+    """A limit in steps, from one in frames, of which a step takes several."""
     return math.ceil(limit / frames) if _is_limit(limit) else None
 
 
 def _time_limit(env: Any) -> int | None:
-    """Steps of an episode of Gymnasium's, by its shortest time limit."""
+    """Steps of an episode of a Gymnasium environment, by its shortest time limit."""
     spec, frames = env.spec, 1
     told = []
     while env is not env.unwrapped:
@@ -356,14 +356,14 @@ def _checked_bounds(name: str, low: np.ndarray, high: np.ndarray) -> tuple[np.nd
 
 
 def _is_vector(space: Space[Any]) -> TypeGuard[Box]:
-    """Whether it is a vector of floating-point numbers, or one such number."""
+    """Whether a spec is a vector of floating-point numbers, or one such number."""
     if not isinstance(space, Box) or not np.issubdtype(space.dtype, np.floating):
         return False
     return len(space.shape) <= 1
 
 
 def _whole(name: str, parts: Sequence[str], left_out: Sequence[str]) -> tuple[str, ...]:
-    """All parts of an observation in the order of their names, unless that needs a choice."""
+    """All parts of an observation in the order of their names, unless a choice is needed."""
     if not parts:
         raise ValueError(
             f"{name} has no vectors in its observations; a vector of numbers is needed ({PAGE})"

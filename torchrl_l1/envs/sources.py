@@ -38,26 +38,26 @@ from torchrl_l1.envs.tasks import TASKS
 from torchrl_l1.envs.vectors import innermost, simulation_of, vector_environment
 
 MakeEnv: TypeAlias = str | Task | Callable[[], EnvBase]
-"""A name, a task of ours, or a function that makes an environment."""
+"""A name, one of our tasks, or a function that makes an environment."""
 
 FORMS = (
     "gymnasium/ID (gymnasium/Pendulum-v1), a task of ours "
     f"({', '.join(TASKS)}), PACKAGE:ID, dm_control/DOMAIN/TASK, or MODULE:FUNCTION and "
     "FILE.py:FUNCTION, which return a TorchRL environment"
 )
-"""What names there are, in words."""
+"""The supported kinds of names, in words."""
 
 
 @dataclass(frozen=True)
 class EnvironmentSource:
-    """Makes the same environment as often as it is asked to.
+    """Makes the same environment any number of times.
 
     Attributes:
-        name: by which :func:`environment_source` finds it again; empty for a function.
-        build: makes one environment, as its library has it.
-        task: where it is a task of ours.
-        gymnasium_id: where it is one of Gymnasium's, the id without the package before it.
-        observation_keys: parts that make the observation, where not all do.
+        name: name by which :func:`environment_source` finds it again; empty for a function.
+        build: makes one environment, as its library provides it.
+        task: the task, if it is one of ours.
+        gymnasium_id: the id without the package before it, if it is one of Gymnasium's.
+        observation_keys: parts that make up the observation, if not all do.
     """
 
     name: str
@@ -68,7 +68,7 @@ class EnvironmentSource:
 
     @property
     def renders(self) -> bool:
-        """Whether :attr:`build` takes Gymnasium's ``render_mode``."""
+        """Whether :attr:`build` accepts Gymnasium's ``render_mode``."""
         return bool(self.gymnasium_id)
 
     def one(self) -> EnvBase:
@@ -82,16 +82,16 @@ class EnvironmentSource:
         control: Sequence[Transform] = (),
         seed: int | None = None,
     ) -> TransformedEnv:
-        """So many environments at once, disturbed, with what controls them.
+        """Several environments at once, disturbed, with their controllers.
 
         Args:
-            count: how many; an environment that is a batch already keeps its own number.
+            count: how many; an environment that is already a batch keeps its own number.
             disturbances: by name, see :data:`~torchrl_l1.envs.DISTURBANCES`.
-            control: transforms that come last, such as an ``L1Transform``.
-            seed: of the resets.
+            control: transforms to append at the end, such as an ``L1Transform``.
+            seed: seed of the resets.
 
         Raises:
-            ValueError: for a disturbance that cannot act on it.
+            ValueError: for a disturbance that cannot act on the environment.
         """
         given = self._checked(disturbances or {})
         if self.task is not None:
@@ -116,13 +116,13 @@ class EnvironmentSource:
         seed: int | None = None,
         **options: Any,
     ) -> TransformedEnv:
-        """As :meth:`several`, one by itself, which a task of ours has as a batch of one.
+        """As :meth:`several`, for a single one; a task of ours then has a batch of one.
 
         Args:
-            disturbances: as there.
-            control: as there.
-            seed: as there.
-            **options: of what makes it, such as ``render_mode`` where it :attr:`renders`.
+            disturbances: see there.
+            control: see there.
+            seed: see there.
+            **options: options for making it, such as ``render_mode`` if it :attr:`renders`.
         """
         given = self._checked(disturbances or {})
         if self.task is not None:
@@ -143,18 +143,18 @@ class EnvironmentSource:
         return env
 
     def takes(self, disturbance: Disturbance) -> bool:
-        """Whether a disturbance can act on it."""
+        """Whether a disturbance can act on the environment."""
         if not disturbance.of_plant or self.task is not None:
             return True
         return survives_resets(disturbance.name) and simulation_of(self.build()) is not None
 
     def time_step(self) -> float | None:
-        """Time of one environment step in seconds, as far as the environment tells."""
+        """Time of one environment step in seconds, if the environment declares it."""
         return self.task.dt if self.task is not None else time_step(self.build())
 
 
 def the_same(name: str) -> str:
-    """That a function keeps what it made, with the remedy."""
+    """The error that a function returns what it returned before, with the remedy."""
     return f"{name or 'the function'} returns the same environment twice: let it make a new one"
 
 
@@ -184,19 +184,19 @@ def _perturbed(
 
 
 def environment_source(env: MakeEnv, search_path: Sequence[str | Path] = ()) -> EnvironmentSource:
-    """What makes an environment, from its name or a function.
+    """The source of an environment, from its name or a function.
 
     Args:
-        env: ``gymnasium/ID``, a task of ours, ``PACKAGE:ID`` of a package that registers with
-            Gymnasium, ``dm_control/DOMAIN/TASK``, or ``MODULE:FUNCTION`` and ``FILE.py:FUNCTION``
-            of a function without arguments that returns an environment of TorchRL or Gymnasium, or
-            a :class:`Task`; or such a function itself.
-        search_path: folders for files, and for modules that Python's own path does not have; the
+        env: ``gymnasium/ID``; one of our tasks; ``PACKAGE:ID`` of a package that registers with
+            Gymnasium; ``dm_control/DOMAIN/TASK``; ``MODULE:FUNCTION`` or ``FILE.py:FUNCTION`` of a
+            function without arguments that returns an environment of TorchRL or Gymnasium, or a
+            :class:`Task`; or such a function itself.
+        search_path: folders for files, and for modules that are not on Python's own path; the
             working directory comes after them.
 
     Raises:
-        TypeError: for an environment in place of a function that makes it.
-        ValueError: for a name that stands for nothing.
+        TypeError: for an environment instead of a function that makes it.
+        ValueError: for a name that means nothing.
 
     Examples:
         >>> environment_source("gymnasium/Pendulum-v1").time_step()
@@ -243,21 +243,21 @@ def _of_function(name: str, found: Any) -> EnvironmentSource:
 
 
 def _made(function: Callable[[], Any], name: str = "the function") -> EnvBase:
-    """What a function makes, as an environment of TorchRL."""
+    """The result of a function, as an environment of TorchRL."""
     try:
         inspect.signature(function).bind()
-    except ValueError:  # functions of C need not tell their arguments
+    except ValueError:  # functions in C need not declare their arguments
         pass
     except TypeError as error:
         raise ValueError(
             f"{name} cannot be called without arguments ({error}): give a function that can, which "
-            "hands them on"
+            "passes them on"
         ) from None
     made = function()
     if isinstance(made, gymnasium.Env):
         try:
             return GymWrapper(made)
-        except RuntimeError as error:  # of spaces that are mixtures
+        except RuntimeError as error:  # spaces may be mixtures
             raise ValueError(
                 f"{name} returns a {type(made).__name__}, which TorchRL cannot wrap ({error}): its "
                 f"actions are {made.action_space}, its observations {made.observation_space}"

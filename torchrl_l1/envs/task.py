@@ -1,4 +1,4 @@
-"""What a benchmark task is: the facts that physics, rewards and imagination share."""
+"""The definition of a benchmark task, which physics, rewards and imagination share."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ResetFn = Callable[
 
 
 class BadAction(ValueError):
-    """An action that no environment can be given: not finite, or beyond all bounds."""
+    """An action that cannot be given to any environment: not finite, or beyond all bounds."""
 
 
 def never(next_observation: Tensor) -> Tensor:
@@ -34,16 +34,16 @@ def never(next_observation: Tensor) -> Tensor:
 
 
 class AnyTask(Protocol):
-    """What algorithms need to know of a task: one of ours, or an environment of elsewhere.
+    """What algorithms need to know of a task, be it ours or an environment from elsewhere.
 
-    :class:`Task` and :class:`ExternalTask` are such; one of another class needs the ``environment``
-    of the latter, too, for :func:`make_env`. Bounds are one number, or one for each entry of the
-    action.
+    Implemented by :class:`Task` and :class:`ExternalTask`; for :func:`make_env`, any other class
+    also needs the ``environment`` method of the latter. Bounds are one number, or one for each
+    entry of the action.
     """
 
     @property
     def name(self) -> str:
-        """By which :func:`get_task` finds it."""
+        """Name by which :func:`get_task` finds the task."""
 
     @property
     def dt(self) -> float:
@@ -71,7 +71,7 @@ class AnyTask(Protocol):
 
     @property
     def imagined_reward(self) -> RewardFn:
-        """Reward of imagined rollouts."""
+        """Reward in imagined rollouts."""
 
     @property
     def terminated(self) -> Callable[[Tensor], Tensor]:
@@ -101,15 +101,15 @@ def action_bounds(task: AnyTask, device: torch.device | str | None = None) -> tu
 
 @dataclass(frozen=True)
 class Task:
-    """Facts of one benchmark task.
+    """Definition of one benchmark task.
 
-    All functions are batched over leading dimensions. Observations are *clean*: noise is added by
-    :class:`~torchrl_l1.envs.ObservationNoise` after reward and termination are known.
+    All functions are batched over leading dimensions. Observations are *clean*:
+    :class:`~torchrl_l1.envs.ObservationNoise` adds noise after reward and termination are known.
 
     Args:
         name: key of the task in :data:`~torchrl_l1.envs.TASKS`.
-        model_file: MuJoCo XML, relative to Gymnasium's asset folder, or an absolute path (as of one
-            that a package brings along).
+        model_file: MuJoCo XML, relative to Gymnasium's asset folder, or an absolute path (for
+            example of a file in your package).
         timestep: integration step of the XML in seconds.
         frame_skip: number of integration steps per environment step.
         horizon: environment steps after which an episode is truncated.
@@ -124,7 +124,7 @@ class Task:
         reward: ``(observation (..., n), action (..., m), next_observation (..., n)) -> (...)``
             in torch; ``observation`` is the state *before* the step.
         terminated: ``next_observation (..., n) -> bool (...)`` in torch; never by default.
-        reward_in_imagination: reward of imagined rollouts where it is not the real one.
+        reward_in_imagination: reward in imagined rollouts, if it is not the real one.
         patch: optional edit of the :class:`mujoco.MjSpec` before it is compiled.
 
     Examples:
@@ -156,7 +156,7 @@ class Task:
 
     @property
     def imagined_reward(self) -> RewardFn:
-        """Reward of imagined rollouts: the real one unless the task says otherwise."""
+        """Reward in imagined rollouts: the real one unless the task says otherwise."""
         return self.reward_in_imagination or self.reward
 
     @property
@@ -191,12 +191,12 @@ class Task:
             A new :class:`mujoco.MjModel`.
 
         Raises:
-            ValueError: if the XML's timestep, number of actuators or actuator range differ from
-                the table's, so that a changed asset cannot silently change the benchmark.
+            ValueError: if the XML's timestep, number of actuators or actuator range differ from the
+                task's, so that a changed asset cannot silently change the benchmark.
         """
         spec = self.build_spec() if spec is None else spec
         with warnings.catch_warnings():
-            # Gymnasium's half_cheetah.xml uses an attribute that MuJoCo 4 calls deprecated.
+            # Gymnasium's half_cheetah.xml uses an attribute that MuJoCo 4 deprecates.
             warnings.filterwarnings("ignore", message=".*settotalmass.*")
             model = spec.compile()
         found = (model.opt.timestep, model.nu)

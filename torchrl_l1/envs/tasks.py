@@ -18,8 +18,8 @@ from torchrl_l1.registration import EPISODE_STEPS
 # Swimmer: the front end of its head in the frame of the body "torso", metres along that body.
 SWIMMER_TIP = 1.5
 
-# Cart-pole: from the hinge to the tip of the pole, metres; also how precisely the reward asks the
-# tip to be at its highest point.
+# Cart-pole: distance from the hinge to the tip of the pole, metres; also the scale of how closely
+# the reward wants the tip at its highest point.
 POLE_LENGTH = 0.6
 
 
@@ -35,9 +35,9 @@ def observe_swimmer(
 ) -> np.ndarray:
     """The three angles, all velocities, and the mean x velocity of the head's tip in the step.
 
-    The last entry is zero at the start of an episode, where no step was taken. (The authors'
-    environment repeats what it was at the end of the episode before: the data would depend on
-    what ran before them.)
+    The last entry is zero at the start of an episode, before any step. (The authors' environment
+    keeps its value from the end of the previous episode, so the data would depend on what ran
+    before.)
     """
     tip, previous_tip = (q[..., 0] + SWIMMER_TIP * np.cos(q[..., 2]) for q in (qpos, previous_qpos))
     velocity = (tip - previous_tip) / dt
@@ -82,14 +82,14 @@ def pendulum_reward(observation: Tensor, action: Tensor, next_observation: Tenso
 
 
 def swimmer_reward(observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
-    """Tip velocity of the step, less a cost of the action as received, unclipped."""
+    """Tip velocity of the step minus a cost of the action as received, unclipped."""
     return next_observation[..., -1] - 1e-4 * action.square().sum(-1)
 
 
 def swimmer_imagined_reward(
     observation: Tensor, action: Tensor, next_observation: Tensor
 ) -> Tensor:
-    """As the authors imagine it: the tip velocity of the step *before*."""
+    """As in the authors' imagination: the tip velocity of the step *before*."""
     return observation[..., -1] - 1e-4 * action.square().sum(-1)
 
 
@@ -119,22 +119,22 @@ def walker_reward(observation: Tensor, action: Tensor, next_observation: Tensor)
 
 
 def walker_imagined_reward(observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
-    """As the authors imagine it: the height is that *after* the step."""
+    """As in the authors' imagination: the height is that *after* the step."""
     alive = (~walker_fallen(next_observation)).to(observation)
     return observation[..., 8] - _control_cost(action) - _height_cost(next_observation) + alive
 
 
 def cheetah_reward(observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
-    """Speed before the step less the control cost (clipped action)."""
+    """Speed before the step minus the control cost (clipped action)."""
     return observation[..., 8] - _control_cost(action)
 
 
 def cartpole_reward(observation: Tensor, action: Tensor, next_observation: Tensor) -> Tensor:
-    r"""How near the pole's tip is to its highest point over the middle of the rail, after the step.
+    r"""Closeness of the pole's tip to its highest point above the middle of the rail, after a step.
 
-    :math:`e^{-d^2 / l^2} - 0.01 \lVert a \rVert^2`, with the distance d of the tip
-    :math:`(x - l \sin\theta, -l \cos\theta)` from :math:`(0, l)`, and the action as received,
-    unclipped. Upright in the middle and without force it is one, hanging there :math:`e^{-4}`.
+    :math:`e^{-d^2 / l^2} - 0.01 \lVert a \rVert^2`, with the distance d of the tip :math:`(x - l
+    \sin\theta, -l \cos\theta)` from :math:`(0, l)`, and the action as received, unclipped. Upright
+    in the middle and without force it is one, hanging there :math:`e^{-4}`.
     """
     x, theta = next_observation[..., 0], next_observation[..., 1]
     across = x - POLE_LENGTH * theta.sin()
@@ -144,7 +144,7 @@ def cartpole_reward(observation: Tensor, action: Tensor, next_observation: Tenso
 
 
 def unclamp_actuators(spec: mujoco.MjSpec) -> None:
-    """Let actuators follow inputs beyond their ``ctrlrange``, which stays what it is."""
+    """Let actuators follow inputs beyond their ``ctrlrange``, which itself stays unchanged."""
     for actuator in spec.actuators:
         actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
 
@@ -168,7 +168,7 @@ _INVERTED_PENDULUM = Task(
 )
 
 # The same with the motor of the original experiments: MuJoCo 1.31 let it follow inputs beyond its
-# range, which only a policy whose actions are not clipped (nor corrected by L1) ever sends.
+# range, which only a policy whose actions are neither clipped nor corrected by L1 ever sends.
 _INVERTED_PENDULUM_UNCLAMPED = replace(
     _INVERTED_PENDULUM, name="inverted_pendulum_unclamped", patch=unclamp_actuators
 )
@@ -192,8 +192,8 @@ _SWIMMER = Task(
     reward_in_imagination=swimmer_imagined_reward,
 )
 
-# Observation: torso height, pitch, three joint angles, then all velocities; entry 5 is the
-# x velocity. It goes on lying on the ground: no state ends the episode.
+# Observation: torso height, pitch, three joint angles, then all velocities; entry 5 is the x
+# velocity. An episode continues with the hopper on the ground: no state ends it.
 _HOPPER = Task(
     name="hopper",
     model_file="hopper.xml",
@@ -209,9 +209,9 @@ _HOPPER = Task(
     reward=hopper_reward,
 )
 
-# Observation: torso height, pitch, six joint angles, then all velocities; entry 8 is the
-# x velocity. A fall ends the episode. The XML is the one with different feet (sliding friction 0.9
-# and 1.9), as the authors'; walker2d_v5.xml has 1.9 on both.
+# Observation: torso height, pitch, six joint angles, then all velocities; entry 8 is the x
+# velocity. A fall ends the episode. The XML is the one with different feet (sliding friction 0.9
+# and 1.9), like the authors'; walker2d_v5.xml has 1.9 on both.
 _WALKER = Task(
     name="walker",
     model_file="walker2d.xml",
@@ -281,7 +281,7 @@ TASKS: dict[str, Task] = {
 
 
 def built_in_task(task: str | Task) -> Task:
-    """One of our own tasks by name; a :class:`~torchrl_l1.envs.Task` passes through.
+    """One of our own tasks by name; a :class:`~torchrl_l1.envs.Task` is returned as it is.
 
     Raises:
         KeyError: if no task has this name; the message lists those that exist.
@@ -294,5 +294,5 @@ def built_in_task(task: str | Task) -> Task:
 
 
 def is_plain(name: str) -> bool:
-    """Whether a name can only be that of a task of ours."""
+    """Whether a name can only mean one of our tasks."""
     return "/" not in name and ":" not in name and name not in gymnasium.registry

@@ -1,4 +1,4 @@
-"""Environments of any library as vectors of numbers, and what is inside them."""
+"""Environments of any library in terms of vectors, and access to the objects inside them."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ AnyEnv: TypeAlias = EnvBase | gymnasium.Env[Any, Any]
 def vector_environment(env: EnvBase, keys: Sequence[str] = ()) -> EnvBase:
     """An environment with a vector ``observation`` and a vector ``action``, both float32.
 
-    Where the observation comes in parts, as dm_control's does, they are joined in the order of
-    their names. Actions are clipped to their bounds, as an actuator would, but for our own tasks.
+    If the observation has several parts, as dm_control's has, they are joined in the order of their
+    names. Actions are clipped to their bounds, as an actuator would, except in our own tasks.
 
     Args:
         env: the environment.
-        keys: the parts that make the observation, in this order; if none are given, ``observation``
-            or, where that is no part, all.
+        keys: the parts that make up the observation, in this order; by default ``observation`` or,
+            if there is no such part, all.
 
     Raises:
         TypeError: for an environment of Gymnasium.
@@ -82,7 +82,7 @@ def vector_environment(env: EnvBase, keys: Sequence[str] = ()) -> EnvBase:
 
 
 class _Observed(DTypeCastTransform):
-    """In single precision, and a copy: some environments write all to the same array."""
+    """Convert to single precision in a copy: some environments reuse one array for all outputs."""
 
     def __init__(self, dtype: torch.dtype) -> None:
         super().__init__(dtype, torch.float32, in_keys=["observation"])
@@ -92,7 +92,7 @@ class _Observed(DTypeCastTransform):
 
 
 class _Executed(DTypeCastTransform):
-    """In the environment's type and within its bounds, where rounded ones may not lie either."""
+    """Convert to the environment's type, within its bounds despite rounding."""
 
     def __init__(self, spec: TensorSpec, is_clipped: bool) -> None:
         super().__init__(spec.dtype, torch.float32, in_keys=[], in_keys_inv=["action"])
@@ -127,10 +127,10 @@ def _in_words(spec: Composite) -> str:
 
 
 def check_keys(keys: Sequence[str], there: Sequence[str] | Mapping[str, Any], name: str) -> None:
-    """Refuse parts of an observation that an environment does not have, or that come twice.
+    """Reject parts of an observation that an environment lacks, or that occur twice.
 
     Raises:
-        ValueError: naming them and those that there are.
+        ValueError: naming them and the existing ones.
     """
     for key in keys:
         if key not in there:
@@ -145,7 +145,7 @@ def check_keys(keys: Sequence[str], there: Sequence[str] | Mapping[str, Any], na
 def vectors(env: EnvBase) -> dict[str, TensorSpec]:
     """Floating-point observations that are vectors, or numbers, and not nested.
 
-    Rewards that a transform sums up are none.
+    Rewards summed by a transform do not count.
     """
     dims = len(env.batch_size)
     sums = {
@@ -165,7 +165,7 @@ def vectors(env: EnvBase) -> dict[str, TensorSpec]:
 
 
 def parts_left_out(env: EnvBase, found: Mapping[str, TensorSpec]) -> list[str]:
-    """Parts of a dictionary of Gymnasium's that are none of the vectors found."""
+    """Parts of Gymnasium's dictionary that are not among the vectors found."""
     space = getattr(wrapped(env), "observation_space", None)
     there = env.full_observation_spec.keys()
     parts = space if isinstance(space, gymnasium.spaces.Dict) else ()
@@ -173,23 +173,23 @@ def parts_left_out(env: EnvBase, found: Mapping[str, TensorSpec]) -> list[str]:
 
 
 def unclear(left_out: Sequence[str], found: Iterable[str]) -> str:
-    """That the parts which are vectors may not be all that there is to know."""
+    """The error that the vector parts may not contain everything there is to know."""
     return (
-        f"the observations {', '.join(left_out)} are no vectors of floating-point numbers: say "
+        f"the observations {', '.join(left_out)} are not vectors of floating-point numbers: say "
         f"which others make the state, such as observation_keys=[{','.join(sorted(found))}], or "
-        "leave them out by gymnasium.wrappers.FilterObservation"
+        "leave them out with gymnasium.wrappers.FilterObservation"
     )
 
 
 def innermost(env: AnyEnv) -> Any:
-    """An environment without transforms and wrappers, as its library has it."""
+    """An environment without transforms and wrappers, as its library provides it."""
     inner = wrapped(env)
     return _base(env) if inner is None else getattr(inner, "unwrapped", inner)
 
 
 def wrapped(env: AnyEnv) -> Any:
-    """What TorchRL wraps, or one of Gymnasium's itself; ``None`` if there is nothing wrapped."""
-    # Not getattr, by which a batch asks its members.
+    """The environment that TorchRL wraps, or Gymnasium's itself; ``None`` if nothing is wrapped."""
+    # Not getattr, with which a batch asks its members.
     return env if isinstance(env, gymnasium.Env) else _base(env).__dict__.get("_env")
 
 

@@ -11,7 +11,7 @@ from torchrl_l1.objectives.trpo import TRPOConfig, TRPOReport, fisher_stride, ta
 
 
 def is_tanh_network(network: nn.Module) -> bool:
-    """Whether a module is linear layers with biases in sequence, a tanh between each two."""
+    """Whether a module is a sequence of linear layers with biases and a tanh between each two."""
     if not isinstance(network, nn.Sequential) or len(network) % 2 == 0:
         return False
     layers, activations = list(network)[::2], list(network)[1::2]
@@ -21,7 +21,7 @@ def is_tanh_network(network: nn.Module) -> bool:
 
 
 def is_frozen(parameter: Tensor) -> bool:
-    """Whether it is a parameter that is not to be trained; other tensors are none."""
+    """Whether it is a parameter that is not to be trained; other tensors are never frozen."""
     return isinstance(parameter, nn.Parameter) and not parameter.requires_grad
 
 
@@ -36,25 +36,25 @@ def gaussian_trpo_step(
 ) -> TRPOReport:
     r"""The step of :func:`trpo_step` for a normal distribution with independent entries.
 
-    With the network's mean :math:`\mu(x)`, its Jacobian :math:`J` in the weights, and the standard
-    deviations :math:`\sigma`, the gradient of the surrogate is that of the advantage-weighted
-    log-likelihood, and the Fisher matrix has the two blocks
+    With the network's mean :math:`\mu(x)`, its Jacobian :math:`J` with respect to the weights, and
+    the standard deviations :math:`\sigma`, the gradient of the surrogate is that of the
+    advantage-weighted log-likelihood, and the Fisher matrix has the two blocks
 
     .. math::
         \mathbb{E}\,[J^\top \mathrm{diag}(\sigma^{-2}) J] \quad \text{and} \quad 2 I,
 
-    of the weights and of :math:`\log \sigma`. A product with the first is a pass of tangents
-    forward and one back: the same numbers as by differentiating the KL divergence twice, up to
-    rounding, in a fraction of the time.
+    for the weights and for :math:`\log \sigma`. A product with the first block takes one forward
+    pass of tangents and one backward pass: the same numbers as from differentiating the KL
+    divergence twice, up to rounding, in a fraction of the time.
 
-    All of them change: a policy of which some parameters are frozen takes :func:`trpo_step`.
+    All parameters are changed: a policy with frozen parameters needs :func:`trpo_step`.
 
     Args:
         mean: the network, see :func:`is_tanh_network`; changed in place.
         log_std: logarithm of the standard deviations ``(m,)``; changed in place.
-        inputs: what the network reads ``(B, n)``.
+        inputs: the network's inputs ``(B, n)``.
         action: samples ``(B, m)``.
-        advantage: theirs ``(B, 1)``.
+        advantage: advantages of the samples ``(B, 1)``.
         config: see :class:`TRPOConfig`.
 
     Raises:
@@ -115,7 +115,7 @@ class _GaussianProblem:
         self.biases = [layer.bias.detach() for layer in layers]
         self.log_std = log_std.detach()
         network = [part for pair in zip(self.weights, self.biases, strict=True) for part in pair]
-        # They share memory with the network's: a step changes that.
+        # They share memory with the network's parameters: a step changes those.
         self.parameters = [self.log_std, *network]
         self.shapes = [parameter.shape for parameter in self.parameters]
         self.action, self.advantage = action, advantage.reshape(-1)
@@ -172,7 +172,7 @@ def _push(
     units: Sequence[Tensor],
     slopes: Sequence[Tensor],
 ) -> Tensor:
-    """Change of the outputs when weights and biases change, to first order, at weights ``at``."""
+    """First-order change of the outputs when weights and biases change, at weights ``at``."""
     tangent = torch.addmm(biases[0], units[0], weights[0].t())
     for layer, slope in enumerate(slopes, 1):
         tangent = tangent.mul_(slope) @ at[layer].t()
@@ -186,6 +186,6 @@ def _pull(by_output: Tensor, at: Sequence[Tensor], units: Sequence[Tensor]) -> l
     for layer in range(len(at) - 1, -1, -1):
         gradients += [by_output.sum(0), (by_output.t() @ units[layer]).flatten()]
         if layer:
-            # Times the tanh's slope, in one pass.
+            # Multiplied by the tanh's slope, in one pass.
             by_output = torch.ops.aten.tanh_backward(by_output @ at[layer], units[layer])
     return gradients[::-1]

@@ -11,17 +11,17 @@ from torchrl_l1.checks import check_not_negative
 class LinearFeatureBaseline(nn.Module):
     """Value estimate, linear in ``[o, o^2, t/100, (t/100)^2, (t/100)^3, 1]`` (o clipped to +-10).
 
-    Refitted in closed form by ridge regression on each batch (arXiv 1604.06778). Being exact
-    for its features, it has no step size to tune and costs milliseconds, which is why it is
-    preferred here to a value network: METRPO refits it twenty times per outer iteration.
+    Refitted in closed form by ridge regression on each batch (arXiv 1604.06778). The fit is exact
+    for these features, has no step size to tune and takes milliseconds. It is preferred here to a
+    value network because METRPO refits it twenty times per outer iteration.
 
     Args:
         observation_dim: number of observations, n.
         ridge: regularisation of the least squares problem.
 
     Raises:
-        ValueError: for a negative ``ridge``; at a fit without one, if the data do not determine the
-            coefficients.
+        ValueError: for a negative ``ridge``; at a fit with ``ridge=0``, if the data do not
+            determine the coefficients.
     """
 
     coefficients: Tensor

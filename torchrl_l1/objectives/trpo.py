@@ -25,11 +25,11 @@ class TRPOConfig:
         max_kl: bound on the mean KL divergence between old and new policy, in nats.
         damping: multiple of the identity added to the Fisher matrix.
         cg_iterations: conjugate gradient iterations.
-        fisher_fraction: share of the samples on which the Fisher matrix is estimated: every tenth,
-            for 0.1, in the order in which they are given, which must not repeat itself with them.
+        fisher_fraction: share of the samples on which the Fisher matrix is estimated: 0.1 takes
+            every tenth in the given order, which must not repeat with that period.
         backtrack_ratio: factor between successive line search candidates.
-        max_backtracks: number of candidates tried.
-        accept_ratio: least ratio of actual to predicted improvement of the surrogate.
+        max_backtracks: number of candidates to try.
+        accept_ratio: smallest accepted ratio of actual to predicted improvement of the surrogate.
     """
 
     max_kl: float = 0.01
@@ -51,9 +51,9 @@ class TRPOConfig:
 
 @dataclass
 class TRPOReport:
-    """What a step did: surrogate improvement, KL reached, whether and after how many trials.
+    """Outcome of a step: surrogate improvement, KL divergence, whether and after how many trials.
 
-    The KL divergence is no number where the curvature, or every candidate, is not finite.
+    The KL divergence is NaN if the curvature, or every candidate, is not finite.
     """
 
     improvement: float
@@ -63,7 +63,7 @@ class TRPOReport:
 
 
 class NonFiniteAdvantages(ValueError):
-    """Advantages are infinite or no numbers: no step can be taken from them."""
+    """Advantages are infinite or NaN, so no step can be computed from them."""
 
 
 def conjugate_gradient(
@@ -75,8 +75,8 @@ def conjugate_gradient(
         matvec: ``v -> A v`` for vectors ``(d,)``.
         b: right-hand side ``(d,)``.
         iterations: at most this many products with ``A``.
-        tolerance: stop once the squared residual falls to it, or to this share of that of ``b``
-            where ``b`` is shorter than one.
+        tolerance: stop once the squared residual falls to it, or to this share of that of ``b`` if
+            ``b`` is shorter than one.
     """
     x = torch.zeros_like(b)
     residual = b.clone()
@@ -96,10 +96,10 @@ def conjugate_gradient(
 
 
 class TrustRegionProblem(Protocol):
-    """What a step needs to know of a policy and its samples.
+    """What a step needs from a policy and its samples.
 
     Attributes:
-        parameters: those that a step changes, in place.
+        parameters: the parameters that a step changes, in place.
     """
 
     parameters: list[Tensor]
@@ -113,7 +113,7 @@ class TrustRegionProblem(Protocol):
         ...
 
     def evaluate(self) -> tuple[Tensor, Tensor]:
-        """Improvement of the surrogate and mean KL divergence at the present parameters."""
+        """Improvement of the surrogate and mean KL divergence at the current parameters."""
         ...
 
 
@@ -122,38 +122,37 @@ def trpo_step(
 ) -> TRPOReport:
     """Take one TRPO step on ``actor`` in place (arXiv 1502.05477).
 
-    The direction is the natural gradient of the importance-weighted surrogate; the step length
-    starts at the trust region's edge and is shortened until both the surrogate improves as it
-    should and the mean KL divergence stays within bounds. If no candidate passes, the
-    parameters stay as they were. :func:`gaussian_trpo_step` does the same faster for one kind of
-    policy.
+    The direction is the natural gradient of the importance-weighted surrogate. The step length
+    starts at the edge of the trust region and is reduced until the surrogate improves sufficiently
+    and the mean KL divergence stays within its bound. If no candidate passes, the parameters stay
+    as they were. :func:`gaussian_trpo_step` does the same faster for one kind of policy.
 
     Args:
         actor: stochastic policy with a closed-form KL divergence, e.g. Gaussian.
-        data: samples of any batch size, ``[B]`` or ``[N, T]``, with ``observation`` (whatever the
-            actor reads), ``action`` and ``advantage`` ``(..., 1)``.
+        data: samples of any batch size, ``[B]`` or ``[N, T]``, with ``observation`` (or whatever
+            the actor reads), ``action`` and ``advantage`` ``(..., 1)``.
         config: see :class:`TRPOConfig`.
 
     Raises:
         KeyError: if there is no ``action`` or ``advantage``.
         NonFiniteAdvantages: if the advantages are not finite.
-        ValueError: if there is not one density per sample, or all of the actor is frozen.
+        ValueError: if there is not one density per sample, or the whole actor is frozen.
     """
     for key in ("action", "advantage"):
         if data.get(key, None) is None:
             raise KeyError(
                 f"TRPO found no {key!r} in the data, only {sorted(map(str, data.keys()))}: rename "
-                "what stands for it"
+                "the entry that holds it"
             )
     return take_step(_AutogradProblem(actor, data, config), data["advantage"], config)
 
 
 def take_step(problem: TrustRegionProblem, advantage: Tensor, config: TRPOConfig) -> TRPOReport:
-    """The step of :func:`trpo_step` for whatever can tell gradients and Fisher products.
+    """The step of :func:`trpo_step` for any object with gradients and Fisher products.
 
     Args:
-        problem: its parameters are changed in place.
-        advantage: of the samples, of any shape, to be checked.
+        problem: the problem, whose parameters are changed in place.
+        advantage: advantages of the samples, of any shape, to be checked.
         config: settings.
 
     Raises:
@@ -167,7 +166,7 @@ def take_step(problem: TrustRegionProblem, advantage: Tensor, config: TRPOConfig
 
     parameters = problem.parameters
     gradient = problem.gradient()
-    # The step is as long whatever the gradient's length, but squares of a tiny one would be lost.
+    # The gradient's length does not affect the step's, but squares of a tiny one would be lost.
     largest = gradient.abs().max()
     unit = gradient / largest if 0 < largest < 1e-5 else gradient
     direction = conjugate_gradient(product, unit, config.cg_iterations)
@@ -189,7 +188,7 @@ def take_step(problem: TrustRegionProblem, advantage: Tensor, config: TRPOConfig
             if enough and kl <= config.max_kl:
                 return TRPOReport(improvement.item(), kl.item(), True, trial)
         _write(start, parameters)
-    # Not even the shortest step leads to numbers: that is no step that was merely too long.
+    # Even the shortest step gives no finite numbers: it was not merely too long.
     known = torch.isfinite(improvement) and torch.isfinite(kl)
     return TRPOReport(0.0, 0.0 if known else math.nan, False, config.max_backtracks)
 
@@ -202,12 +201,12 @@ def _write(vector: Tensor, parameters: list[Tensor]) -> None:
 
 
 class _AutogradProblem:
-    """A problem whose derivatives are autograd's, for any actor."""
+    """A problem for any actor, differentiated by autograd."""
 
     def __init__(
         self, actor: ProbabilisticTensorDictSequential, data: TensorDictBase, config: TRPOConfig
     ) -> None:
-        # How samples were drawn is no part of the surrogate. In one row, of which some are taken.
+        # How samples were drawn is not part of the surrogate. One row, from which a share is taken.
         data = data.detach().reshape(-1)
         self.actor, self.data, self.config = actor, data, config
         self.parameters = [p for p in actor.parameters() if p.requires_grad]
@@ -220,8 +219,8 @@ class _AutogradProblem:
             if self.old_log_prob.shape != wanted:
                 raise ValueError(
                     f"TRPO: the actor's {type(self.old).__name__} gives log-densities of shape "
-                    f"{tuple(self.old_log_prob.shape)} for advantages of {tuple(wanted)}: it must "
-                    "be one of whole actions, such as IndependentNormal of TorchRL"
+                    f"{tuple(self.old_log_prob.shape)} for advantages of {tuple(wanted)}: use one "
+                    "over whole actions, such as IndependentNormal of TorchRL"
                 )
             self.before = self._surrogate(self.old)
         self._divergence_gradient: Tensor | None = None
@@ -261,12 +260,12 @@ class _AutogradProblem:
 
 
 def fisher_stride(config: TRPOConfig) -> int:
-    """The Fisher matrix is estimated on every so manieth sample."""
+    """The Fisher matrix is estimated on every n-th sample."""
     return max(1, round(1 / config.fisher_fraction))
 
 
 def _flat_gradient(scalar: Tensor, parameters: list[Tensor], create_graph: bool = False) -> Tensor:
-    # The distribution need not depend on all, as on the head of a value beside it.
+    # The distribution may not depend on all, such as on the head of a value beside it.
     gradients = torch.autograd.grad(
         scalar, parameters, create_graph=create_graph, allow_unused=True, materialize_grads=True
     )

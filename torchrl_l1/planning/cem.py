@@ -31,12 +31,12 @@ class CEMConfig:
         elites: best sequences to which the distribution is fitted.
         iterations: rounds of drawing and fitting, at most.
         momentum: weight of the old mean and variance in the new ones. The more iterations there
-            are, the higher it may be: the variance shrinks more slowly, and less often before
+            are, the higher it may be: the variance then shrinks more slowly, and less often before
             the mean has arrived.
-        initial_variance: of the actions, action units squared; ``None`` for the square of a
-            quarter of each action's range.
-        minimum_variance: an environment whose variances are all at most this is done after an
-            iteration, action units squared; 0 lets all iterations run.
+        initial_variance: initial variance of the actions, action units squared; ``None`` for the
+            square of a quarter of each action's range.
+        minimum_variance: an environment stops after an iteration in which all its variances are at
+            most this, action units squared; 0 runs all iterations.
         return_best: execute the best sequence ever drawn instead of the final mean.
     """
 
@@ -74,14 +74,14 @@ def plan(
 ) -> Plan:
     """Maximise returns over action sequences.
 
-    Sequences whose return is not finite are never elites; where all of an iteration are such,
-    mean and variance stay as they are.
+    Sequences whose return is not finite are never elites; if that holds for all sequences of an
+    iteration, mean and variance stay as they are.
 
     Args:
         evaluate: returns ``(N, C)`` of sequences ``(N, C, H, m)``.
-        mean: where to start ``(N, H, m)``, for example a previous plan, shifted.
+        mean: initial mean ``(N, H, m)``, for example a previous plan, shifted.
         low: lower bounds of the actions, ``(m,)`` or one number.
-        high: upper bounds.
+        high: upper bounds, likewise.
         config: the settings.
         generator: source of randomness; torch's global one if ``None``.
 
@@ -117,7 +117,7 @@ def plan(
     for _ in range(config.iterations):
         sequences = sample_around(mean, variance, low, high, config.candidates, generator)
         returns = evaluated(evaluate, sequences)
-        # What others of the batch still need is not to change the plan of one that is done.
+        # Further iterations for the rest of the batch must not change a plan that is done.
         returns = torch.where(unfinished[:, None], returns, -torch.inf)
         best, best_return = keep_best(best, best_return, sequences, returns)
         values, index = returns.topk(config.elites, dim=1)
@@ -130,7 +130,7 @@ def plan(
         unfinished = unfinished & (variance.amax((1, 2)) > config.minimum_variance)
         if not unfinished.any():
             break
-    # Rounding of the momentum's sum may step over a bound.
+    # Rounding of the sum with momentum may exceed a bound.
     mean = torch.minimum(torch.maximum(mean, low), high)
     actions = best if config.return_best else mean
     return Plan(actions, mean, variance, best, best_return)
@@ -146,9 +146,9 @@ def sample_around(
 ) -> Tensor:
     """Sequences ``(N, C, H, m)`` around a mean ``(N, H, m)``, all within the bounds.
 
-    Normal, truncated at two standard deviations, which are first narrowed until they fit
-    between the mean and the nearer bound (as in the code of arXiv 1805.12114). The variance of
-    a sample is therefore 0.774 of the one given, or less.
+    Normal, truncated at two standard deviations, which are first narrowed until they fit between
+    the mean and the nearer bound (as in the code of arXiv 1805.12114). The variance of a sample is
+    therefore at most 0.774 times the one given.
     """
     room = torch.minimum(mean - low, high - mean).clamp_min(0) / 2
     std = torch.minimum(variance.sqrt(), room).unsqueeze(1)

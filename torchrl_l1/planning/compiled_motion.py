@@ -28,22 +28,22 @@ def resolve_compilation(
     propagation: str = "tsinf",
     name: str = "compile",
 ) -> bool:
-    """``"auto"`` becomes ``True`` on a GPU with a compiler, where many small calls cost most.
+    """Resolve ``"auto"`` to ``True`` on a GPU with a compiler, where many small calls cost most.
 
-    On the CPU it becomes ``False``. The eager path takes a block of particles through a member's
-    layers while they are in the cache; compiled, all members go through a layer together. In
-    float32 that is slower; in bfloat16 it is somewhat faster, but compiling takes some ten seconds
-    of every run.
+    On the CPU it becomes ``False``. The eager path passes a block of particles through a member's
+    layers while they are in the cache; the compiled one passes all members through a layer
+    together. In float32 that is slower; in bfloat16 it is somewhat faster, but compiling takes some
+    ten seconds of every run.
 
     Args:
-        mode: ``"auto"``, or what is to be returned.
-        device: where plans are made.
-        propagation: how particles travel. ``"ts1"`` is eager: how many rows a member has changes
-            from step to step.
-        name: of the setting, in error messages.
+        mode: ``"auto"``, or the value to return.
+        device: device on which plans are made.
+        propagation: how particles travel. ``"ts1"`` runs eagerly, since the number of rows per
+            member changes from step to step.
+        name: name of the setting, for the error message.
 
     Raises:
-        ValueError: for another mode, or ``True`` with ``"ts1"``.
+        ValueError: for an unknown mode, or ``True`` with ``"ts1"``.
     """
     if check_mode(mode, name) is False:
         return False
@@ -65,17 +65,17 @@ def compiled_predictor(
     draws: Draws,
     mode: CompileMode,
 ) -> Predict:
-    """What :func:`torchrl_l1.planning.particles.predictor` gives, compiled.
+    """The compiled form of :func:`torchrl_l1.planning.particles.predictor`.
 
-    Plans with ensembles of the same shape and precision, the same shares and the same propagation
-    share a graph, whatever the weights and the number of rows.
+    Plans share a graph if their ensembles have the same shape and precision and they use the same
+    shares and propagation, whatever the weights and the number of rows.
 
     Args:
         network: the members.
         propagation: ``"tsinf"`` or ``"mean"``.
         shares: particles of each member.
         draws: the noise.
-        mode: ``"auto"`` warns where the compiler fails, and runs the same operations one by one;
+        mode: ``"auto"`` warns if the compiler fails and runs the same operations one by one;
             ``True`` raises.
     """
     together = propagation == "mean"
@@ -95,11 +95,11 @@ def compiled_predictor(
     return predict
 
 
-# One for each kind of plan: torch keeps eight graphs of a function, and then gives up.
+# One for each kind of plan: torch keeps eight graphs of a function, then gives up.
 @cache
 def _compiled(kind: tuple[Any, ...], mode: CompileMode) -> Callable[..., Tensor]:
-    notice = "plans go on without compilation, which failed"
-    # The number of rows is marked as free; all other sizes are those of the kind.
+    notice = "plans continue without compilation, which failed"
+    # The number of rows is marked as dynamic; all other sizes are fixed for the kind.
     return compiled(cast(FunctionType, _change), mode, dynamic=None, notice=notice)
 
 
@@ -147,6 +147,6 @@ def _raw(network: PlanningNetwork, first: int, last: int, inputs: Tensor) -> Ten
 
 
 def _has_compiler() -> bool:
-    # Triton writes the kernels, and a C compiler what starts them.
+    # Triton writes the kernels, and a C compiler builds their launcher.
     compilers = (os.environ.get("CC"), "cc", "gcc", "clang")
     return find_spec("triton") is not None and any(map(shutil.which, filter(None, compilers)))

@@ -28,8 +28,8 @@ class MPPIConfig:
         candidates: sequences drawn per iteration and environment, C.
         iterations: rounds of drawing and averaging.
         temperature: difference in return by which a sequence's weight falls to 1/e.
-        variance: of the actions before they are clipped, action units squared; ``None`` for the
-            square of a quarter of each action's range.
+        variance: variance of the actions before they are clipped, action units squared; ``None``
+            for the square of a quarter of each action's range.
         return_best: execute the best sequence ever drawn instead of the final mean.
     """
 
@@ -58,9 +58,9 @@ def plan(
 ) -> Plan:
     r"""Move the mean to the average of sequences weighted by :math:`e^{R / \lambda}`.
 
-    The information-theoretic update of arXiv 1707.02342 without its control cost, on normal
-    samples that are clipped to the bounds. Arguments and errors are those of
-    :func:`torchrl_l1.planning.cem.plan`. Sequences whose return is not finite weigh nothing.
+    The information-theoretic update of arXiv 1707.02342 without its control cost, on normal samples
+    that are clipped to the bounds. Arguments and errors are those of
+    :func:`torchrl_l1.planning.cem.plan`. Sequences whose return is not finite have zero weight.
 
     Examples:
         >>> result = plan(
@@ -88,11 +88,11 @@ def plan(
         best, best_return = keep_best(best, best_return, sequences, returns)
         highest = returns.amax(1, keepdim=True)
         found = torch.isfinite(highest)
-        # Relative to the highest, lest the exponentials overflow.
+        # Relative to the highest, so that the exponentials do not overflow.
         exponents = (returns - torch.where(found, highest, 0.0)) / config.temperature
         weights = torch.where(found, exponents, 0.0).softmax(1)
         average = (weights[:, :, None, None] * sequences).sum(1)
         mean = torch.where(found[:, :, None], average, mean)
-    # Rounding of the weights' sum may step over a bound.
+    # Rounding of the weights' sum may exceed a bound.
     mean = torch.minimum(torch.maximum(mean, low), high)
     return Plan(best if config.return_best else mean, mean, variance, best, best_return)

@@ -12,7 +12,7 @@ from torchrl_l1.dynamics.functions import RewardFunction, Termination, one_each
 from torchrl_l1.dynamics.network import ForwardPass, PlanningNetwork
 
 Scenarios = tuple[Tensor, Tensor]
-"""Members ``(H, P)`` and noise ``(H, n, P)`` that the particles of all candidates draw."""
+"""Members ``(H, P)`` and noise ``(H, n, P)`` drawn for the particles of all candidates."""
 
 
 def scenarios(
@@ -22,7 +22,7 @@ def scenarios(
     generator: torch.Generator | None,
     like: Tensor,
 ) -> Scenarios:
-    """Draw what the particles of all candidates meet, on the device of ``like``."""
+    """Draw the members and noise common to all candidates, on the device of ``like``."""
     size, device = (horizon, network.observation_dim, particles), like.device
     members = torch.randint(
         network.members, (horizon, particles), generator=generator, device=device
@@ -38,7 +38,7 @@ class Draws:
         shares: particles of each member, see :func:`member_shares`.
         count: number of trajectories, B.
         horizon: number of steps.
-        common: what all candidates draw; each draws its own if ``None``.
+        common: the draws that all candidates share; each has its own if ``None``.
         generator: source of randomness; torch's global one if ``None``.
     """
 
@@ -60,7 +60,7 @@ class Draws:
             self._particle = torch.cat([own.repeat(candidates) for own in every])
 
     def members(self) -> Tensor:
-        """A member for every step and trajectory ``(H, B)``."""
+        """The member for every step and trajectory ``(H, B)``."""
         if self._common is not None:
             return self._common[0][:, self._particle]
         return torch.randint(
@@ -71,9 +71,9 @@ class Draws:
         )
 
     def noise(self, step: int, order: Tensor | None = None) -> Tensor | None:
-        """Standard normal numbers ``(B, n)`` of a step, column by column in memory.
+        """Standard normal numbers ``(B, n)`` of a step, stored column by column.
 
-        ``order`` says which trajectories they are for; ``None`` if none are needed.
+        ``order`` says for which trajectories they are; ``None`` if none are needed.
         """
         if self._network.standard_deviation is None:
             return None
@@ -92,7 +92,7 @@ Predict = Callable[[Tensor, int], Tensor]
 
 
 def member_shares(network: PlanningNetwork, particles: int, propagation: Propagation) -> list[int]:
-    """Particles of each member; of no member in particular unless it is kept."""
+    """Number of particles per member; not assigned to members unless they keep theirs."""
     if propagation == "tsinf":
         return [len(range(member, particles, network.members)) for member in range(network.members)]
     return [1 if propagation == "mean" else particles]
@@ -105,7 +105,7 @@ def predictor(
     count: int,
     draws: Draws,
 ) -> Predict:
-    """The prediction for B = ``count`` trajectories, sorted as their draws are."""
+    """The prediction for B = ``count`` trajectories, in the order of their draws."""
     k = network.members
     if propagation == "mean":
         everyone = ForwardPass(network, [count] * k, shared=True)
@@ -125,7 +125,7 @@ def predictor(
     memory: dict[tuple[torch.dtype, int], Tensor] = {}
 
     def switching(inputs: Tensor, step: int) -> Tensor:
-        # Rows of the same member next to each other, for as long as the products take.
+        # Rows of the same member are next to each other while the products are computed.
         raw = ForwardPass(network, sizes[step], memory=memory)(inputs[order[step]])
         result = torch.empty_like(inputs[:, : network.observation_dim])
         result[order[step]] = network.sample(raw, draws.noise(step, order[step]))
@@ -148,7 +148,7 @@ def imagined_returns(
     See :func:`torchrl_l1.planning.evaluate`, also for the errors.
     """
     horizon, n = u.shape[0], x.shape[1]
-    # Column by column in memory: all that is done to a state is then done to whole columns.
+    # Stored column by column, so that all operations on a state work on whole columns.
     inputs = x.new_empty(horizon + 1, n + u.shape[2], x.shape[0]).transpose(1, 2)
     states = inputs[..., :n]
     states[0] = x
@@ -157,10 +157,10 @@ def imagined_returns(
         change = predict(inputs[t], t)
         torch.addcmul(states[t], change, network.change_std, out=states[t + 1])
         states[t + 1] += network.change_mean
-    # Rewards may be integers or booleans: discounts and means are not.
+    # Rewards may be integers or booleans; discounts and means are not.
     rewards = one_each(reward, "reward", states[:-1], u, states[1:]).to(u.dtype)
     if terminated is None:
-        # A state that is not finite stays so: the last tells for all.
+        # A non-finite state stays non-finite, so checking the last one suffices.
         sound = torch.isfinite(states[-1]).all(-1)
     else:
         ended = one_each(terminated, "terminated", states[1:]).bool().long()

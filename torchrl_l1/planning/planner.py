@@ -33,43 +33,43 @@ _OPTIMIZERS: dict[type[OptimizerConfig], SequenceOptimizer] = {
     ShootingConfig: random_shooting.plan,
 }
 
-# Numbers in the candidates of the environments that are planned for together, at most (64 MiB).
+# Largest number of entries in the candidates of environments planned for together (64 MiB).
 _PORTION = 2**24
 
 
 class ModelPredictiveController(TensorDictModuleBase):
     """Receding-horizon control with a learned model, as a policy (arXiv 1805.12114).
 
-    Reads the observation and the planner's state and writes the action and, under
-    ``("next", key)``, the next state: ``mean``, the plan without the actions already taken, from
-    which the next one starts, with the middle of the bounds at its end; ``step``, the number of
-    actions since the reset; and ``best_return``, what the last plan promised at best. The
-    environment needs the primer of :meth:`make_primer`, which starts the state at each reset and
-    carries it from step to step, for each environment on its own; an entry ``is_init``
-    (:class:`~torchrl.envs.InitTracker`), if there is one, restarts it as well.
+    It reads the observation and the planner's state. It writes the action and, under ``("next",
+    key)``, the next state: ``mean``, the plan without the actions already taken and with the middle
+    of the bounds appended, from which the next plan starts; ``step``, the number of actions since
+    the reset; and ``best_return``, the best return that the last plan predicted. The environment
+    needs the primer of :meth:`make_primer`, which starts the state at each reset and carries it
+    from step to step, separately for each environment. If there is an entry ``is_init``
+    (:class:`~torchrl.envs.InitTracker`), it restarts the state as well.
 
-    The model is referred to, not registered: its weights are not among this module's
-    parameters, and updating them in place is seen by the next plan. Plans are made on the
-    model's device, wherever the observations are.
+    The model is referenced, not registered: its weights are not among this module's parameters, and
+    in-place updates take effect in the next plan. Plans are made on the model's device, wherever
+    the observations are.
 
     Args:
-        sampler: model, reward and how they are used.
-        config: the optimiser's settings; their type chooses it.
-        action_low: lower bounds of the actions, one number or one for each.
-        action_high: upper bounds.
-        replan_every: actions taken from a plan before the next, counted from each reset.
+        sampler: the model, the reward and how to use them.
+        config: the optimiser's settings, whose type selects it.
+        action_low: lower bounds of the actions, a single number or one per entry.
+        action_high: upper bounds, likewise.
+        replan_every: actions taken from a plan before the next one, counted from each reset.
         observation_key: key of the observation.
         action_key: key of the action.
-        init_key: key of the flag of fresh resets.
-        key: name of the nested tensordict with the planner's state.
+        init_key: key of the flag for fresh resets.
+        key: name of the nested tensordict that holds the planner's state.
         generator: source of randomness; torch's global one if ``None``.
 
     Raises:
         ValueError: for bounds that are empty or of the wrong width, ``replan_every`` outside the
-            horizon, a generator on another device than the model; at a call, for an observation or
-            state of the wrong shape, and for a reward that is not finite where the system is.
-        KeyError: at a call, if the observation or the planner's state is missing.
-        TypeError: for another kind of settings.
+            horizon, or a generator on another device than the model; on a call, for an observation
+            or state of the wrong shape, or a reward that is not finite where the system is.
+        KeyError: on a call, if the observation or the planner's state is missing.
+        TypeError: for settings of an unknown kind.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -137,7 +137,7 @@ class ModelPredictiveController(TensorDictModuleBase):
         self.out_keys = [action_key, *(("next", key, name) for name in self._spec)]
 
     def make_primer(self) -> TensorDictPrimer:
-        """Transform that gives the environment the planner's state, fresh at every reset."""
+        """Transform that adds the planner's state to the environment, fresh at every reset."""
         spec = {name: Unbounded(shape, dtype=dtype) for name, (shape, dtype) in self._spec.items()}
         return TensorDictPrimer(Composite({self.key: Composite(spec)}), expand_specs=True)
 
@@ -146,17 +146,17 @@ class ModelPredictiveController(TensorDictModuleBase):
 
     @torch.no_grad()
     def plan(self, observation: Tensor, start: Tensor | None = None) -> Plan:
-        """Plans for many observations at once, without state: each is planned for as if reset.
+        """Plans for many observations, each made without state, as if just reset.
 
-        Many observations are planned for in portions, so that memory stays bounded.
+        Large numbers of observations are processed in portions, so that memory stays bounded.
 
         Args:
             observation: ``(N, n)``.
-            start: sequences to start from ``(N, H, m)``; the middle of the bounds if ``None``.
+            start: initial sequences ``(N, H, m)``; the middle of the bounds if ``None``.
 
         Returns:
-            The plans, float32, on the model's device. Where an observation is not finite the plan
-            is what it started from.
+            The plans, float32, on the model's device. For an observation that is not finite, the
+            plan is the initial sequence.
 
         Raises:
             ValueError: for no observations, wrong shapes, or a reward that is not finite where the
@@ -196,7 +196,7 @@ class ModelPredictiveController(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Act, and plan where it is time to, see the class."""
+        """Act, and plan when it is time to, see the class."""
         batch = tensordict.batch_size
         observation = self._observation(tensordict)
         count = batch.numel()
@@ -239,9 +239,9 @@ class ModelPredictiveController(TensorDictModuleBase):
         return tensordict
 
     def _check_reward(self, observation: Tensor, action: Tensor, best_return: Tensor) -> None:
-        """Where no candidate has a finite return, find out whether the reward is to blame.
+        """If no candidate has a finite return, find out whether the reward is to blame.
 
-        A model may diverge everywhere; then the plan stays what it was.
+        A model may diverge everywhere; then the plan stays as it was.
         """
         failed = torch.isneginf(best_return)
         if not failed.any():

@@ -25,8 +25,8 @@ class ShootingConfig:
     Attributes:
         horizon: actions in a sequence, H.
         candidates: sequences drawn per environment, C.
-        warm_start: whether the mean given, for example the previous plan, shifted, is one of
-            them; published planners draw all of them (arXiv 1708.02596).
+        warm_start: whether the given mean, for example the previous plan, shifted, is one of them;
+            published planners draw all of them (arXiv 1708.02596).
     """
 
     horizon: int = 25
@@ -37,7 +37,8 @@ class ShootingConfig:
         check_counts(self, "horizon", "candidates", prefix="shooting.")
         if self.warm_start and self.candidates == 1:
             raise ValueError(
-                "shooting.candidates must be at least 2 with a warm start, which is the first"
+                "shooting.candidates must be at least 2 with a warm start, which is the first of "
+                "them"
             )
 
 
@@ -50,10 +51,10 @@ def plan(
     config: ShootingConfig,
     generator: torch.Generator | None = None,
 ) -> Plan:
-    """The best of sequences uniform between the bounds and, with a warm start, of the given mean.
+    """The best of uniform sequences between the bounds and, with a warm start, the given mean.
 
     Arguments and errors are those of :func:`torchrl_l1.planning.cem.plan`. With a warm start the
-    mean is the first candidate; without one it matters only where no return is finite.
+    mean is the first candidate; without one it is used only if no return is finite.
 
     Examples:
         >>> result = plan(

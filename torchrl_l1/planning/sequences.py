@@ -1,4 +1,4 @@
-"""What the optimisers of action sequences share: their contract and checks of arguments."""
+"""The common part of optimisers of action sequences: their contract and argument checks."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Plan(NamedTuple):
         actions: the sequence to execute ``(N, H, m)``: either ``mean`` or ``best``.
         mean: mean of the final distribution ``(N, H, m)``.
         variance: its variance ``(N, H, m)``, action units squared.
-        best: best of all candidates ``(N, H, m)``; the initial mean where no return was finite.
-        best_return: return of ``best`` ``(N,)``; minus infinity where no return was finite.
+        best: best of all candidates ``(N, H, m)``; the initial mean if no return was finite.
+        best_return: return of ``best`` ``(N,)``; minus infinity if no return was finite.
     """
 
     actions: Tensor
@@ -33,9 +33,10 @@ class Plan(NamedTuple):
 
 
 class SequenceOptimizer(Protocol):
-    """What looks for the sequence of the highest return, such as ``plan_cem``.
+    """A search for the sequence with the highest return, such as ``plan_cem``.
 
-    Its settings tell the policy which one to use; they have a ``horizon`` and ``candidates``.
+    The type of the settings tells the policy which one to use; they have ``horizon`` and
+    ``candidates``.
     """
 
     def __call__(
@@ -54,7 +55,7 @@ def checked_mean(mean: Tensor, horizon: int, low: Tensor, high: Tensor) -> Tenso
     """The initial mean within the bounds; it must be ``(N, H, m)``.
 
     Raises:
-        ValueError: for another shape.
+        ValueError: for any other shape.
     """
     if mean.dim() != 3 or mean.shape[1] != horizon:
         raise ValueError(
@@ -65,10 +66,10 @@ def checked_mean(mean: Tensor, horizon: int, low: Tensor, high: Tensor) -> Tenso
 
 
 def evaluated(evaluate: Evaluate, sequences: Tensor) -> Tensor:
-    """Returns of the sequences ``(N, C)``, minus infinity for all that are not finite.
+    """Returns of the sequences ``(N, C)``, minus infinity for any that is not finite.
 
     Raises:
-        ValueError: if ``evaluate`` returns another shape, or writes to the sequences.
+        ValueError: if ``evaluate`` returns the wrong shape, or writes to the sequences.
     """
     returns = untouched(evaluate, "evaluate", sequences)
     if returns.shape != sequences.shape[:2]:
@@ -87,7 +88,7 @@ def select(sequences: Tensor, index: Tensor) -> Tensor:
 def keep_best(
     best: Tensor, best_return: Tensor, sequences: Tensor, returns: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The best sequence ``(N, H, m)`` and its return ``(N,)``, so far and among new ones."""
+    """The best sequence ``(N, H, m)`` and its return ``(N,)``, of the best so far and new ones."""
     value, index = returns.max(dim=1)
     better = value > best_return
     champion = select(sequences, index[:, None])[:, 0]
@@ -98,6 +99,6 @@ def keep_best(
 
 
 def initial_variance(given: float | None, low: Tensor, high: Tensor, like: Tensor) -> Tensor:
-    """The variance to start from, by default that of a standard deviation of range / 4."""
+    """The initial variance, by default that of a standard deviation of range / 4."""
     value = (high - low).square() / 16 if given is None else torch.full_like(low, given)
     return value.expand_as(like).clone()

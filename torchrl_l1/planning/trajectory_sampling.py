@@ -30,8 +30,8 @@ from torchrl_l1.planning.particles import (
 )
 from torchrl_l1.planning.sequences import Evaluate
 
-# Trajectories that go through the horizon together: enough of them to make little of what a call
-# costs, and no more than a processor's caches hold. Elsewhere it only bounds the memory.
+# Trajectories that pass through the horizon together: enough to make the cost of a call negligible,
+# and no more than a CPU's caches hold. On other devices it only bounds the memory.
 _CPU_BLOCK = 8000
 _OTHER_BLOCK = 131_072
 
@@ -57,34 +57,33 @@ def evaluate(
 
     How a particle travels (arXiv 1805.12114, section 5):
 
-    - ``"tsinf"``: particle :math:`p` keeps elite :math:`p \bmod k` for the whole horizon, so
-      that any number of particles will do, but fewer than k leave elites out;
+    - ``"tsinf"``: particle :math:`p` keeps elite :math:`p \bmod k` for the whole horizon; any
+      number of particles is allowed, but fewer than k leave elites out;
     - ``"ts1"``: every particle draws an elite at every step;
-    - ``"mean"``: one particle, whatever ``particles``, moved by the mean of the elites' mean
+    - ``"mean"``: one particle, whatever ``particles`` is, moved by the mean of the elites' mean
       changes.
 
-    With ``"tsinf"`` and ``"ts1"`` the change is sampled from the member's distribution if its
-    head has one. A particle earns the reward of the step that terminates it, and nothing after
-    it: where rewards are negative, shift them, or ending early pays. A particle with a state or
-    reward that is not finite, before it terminates, makes the return of its candidate minus
-    infinity.
+    With ``"tsinf"`` and ``"ts1"`` the change is sampled from the member's distribution if its head
+    has one. A particle earns the reward of the step that terminates it, and nothing after it. If
+    rewards are negative, shift them, or ending early pays. A particle whose state or reward is not
+    finite before it terminates makes the return of its candidate minus infinity.
 
     Args:
-        dynamics: the model, or a snapshot of it, which is taken as it is.
-        observation: where the N environments are ``(N, n)``.
+        dynamics: the model, or a snapshot of it, which is used as it is.
+        observation: observations of the N environments ``(N, n)``.
         actions: candidate sequences ``(N, C, H, m)``; they are not clipped.
         reward: maps observations ``(..., n)``, actions ``(..., m)`` and next observations to
             ``(...)``; it sees whole trajectories at once.
         particles: trajectories per candidate, P.
         propagation: see above.
         terminated: maps next observations ``(..., n)`` to booleans ``(...)``; never if ``None``.
-        common_noise: let particle p of every candidate meet the same draws of members and of noise
-            (common random numbers, arXiv 1301.3878), instead of its own. Each return has the same
-            distribution, comparisons between candidates less variance, and most of the random
+        common_noise: whether particle p of every candidate meets the same draws of members and
+            noise (common random numbers, arXiv 1301.3878) instead of its own. Each return keeps its
+            distribution, comparisons between candidates have less variance, and most of the random
             numbers need not be drawn.
-        precision: of the hidden layers, see :class:`PlanningNetwork`.
-        block: trajectories that go through the horizon together; as many as fit a
-            processor's cache if ``None``, or 131 072 on other devices.
+        precision: precision of the hidden layers, see :class:`PlanningNetwork`.
+        block: number of trajectories that pass through the horizon together; if ``None``, as many
+            as fit a CPU's cache, or 131 072 on other devices.
         discount: the reward of step :math:`t = 0, 1, \ldots` counts ``discount**t`` times.
         compile: whether to compile the motion of the particles, see
             :func:`~torchrl_l1.planning.resolve_compilation`. Eager and compiled returns are
@@ -95,9 +94,9 @@ def evaluate(
         returns ``(N, C)``, float32.
 
     Raises:
-        ValueError: for shapes that do not fit the model, unknown propagation, a discount outside
-            (0, 1], ``"ts1"`` compiled, or a reward or termination of the wrong shape, or one that
-            writes to what it is given.
+        ValueError: for shapes that do not fit the model, an unknown propagation, a discount outside
+            (0, 1], ``"ts1"`` compiled, a reward or termination of the wrong shape, or one that
+            writes to its inputs.
 
     Examples:
         >>> model = EnsembleDynamics(3, 1, members=5, hidden=(8,))
@@ -149,21 +148,21 @@ def evaluate(
 
 @dataclass(frozen=True)
 class TrajectorySampler:
-    """The settings of :func:`evaluate` around a model, for planners.
+    """The settings of :func:`evaluate` for a model, for use by planners.
 
-    The model is referred to: every plan copies its weights as they are then.
+    The model is referenced: every plan copies its current weights.
 
     Attributes:
         dynamics: the model.
-        reward: see :func:`evaluate`, as for all that follow.
+        reward: see :func:`evaluate`, also for all that follow.
         terminated: the task's termination.
         particles: trajectories per candidate.
         propagation: ``"ts1"``, ``"tsinf"`` or ``"mean"``.
-        common_noise: here on by default.
+        common_noise: on by default here.
         precision: ``"auto"``, ``"float32"`` or ``"bfloat16"``.
-        block: trajectories that go through the horizon together.
-        discount: of the rewards, per step.
-        compile: ``True``, ``False``, or ``"auto"`` for what is faster.
+        block: number of trajectories that pass through the horizon together.
+        discount: factor on the rewards per step.
+        compile: ``True``, ``False``, or ``"auto"`` for the faster one.
 
     Raises:
         ValueError: for an unknown propagation, precision or mode of compilation, no particles, a
@@ -192,9 +191,9 @@ class TrajectorySampler:
         )
 
     def choices(self) -> dict[str, str]:
-        """What settings that say ``"auto"`` have become: precision, and compiled or eager plans.
+        """What ``"auto"`` has become: the precision, and compiled or eager plans.
 
-        Whether compiling succeeds is seen by the first plan only.
+        Whether compilation succeeds is known only after the first plan.
         """
         plans = "eager"
         if resolve_compilation(self.compile, self.dynamics.device, self.propagation):
@@ -234,7 +233,7 @@ def check_sampling(
     discount: float = 1.0,
     compile: bool | str = False,
 ) -> None:
-    """Refuse settings of :func:`evaluate` that make no sense.
+    """Reject settings of :func:`evaluate` that make no sense.
 
     Raises:
         ValueError: naming the setting.
