@@ -447,7 +447,7 @@ def test_a_residual_covariance_that_varies_needs_to_be_remembered():
         (nn.ModuleList([nn.Linear(4, 3)]), "model ModuleList failed .*NotImplementedError"),
         (nn.Bilinear(3, 2, 3), r"observation of shape \(3,\) .* action of shape \(1,\)"),
         (lambda both: both, "lambda> failed at its first call"),
-        (nn.Bilinear(3, 1, 3).double(), "both torch.float32, .*RuntimeError"),
+        (nn.Bilinear(3, 1, 3).double(), "both torch.float32: .*RuntimeError"),
     ],
 )
 def test_a_model_that_cannot_be_called_is_named(model, message):
