@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -69,6 +69,32 @@ class OverwritesAfterSteps(Overwrites):
 class WritesInPlace(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         return observation.mul_(0.999)
+
+
+class WritesUncounted(Transform):
+    """NumPy's writes, and those through ``data``, which torch does not count."""
+
+    def __init__(self, view: Callable[[Tensor], Any]) -> None:
+        super().__init__()
+        self.view = view
+
+    def forward(self, observation: Tensor) -> Tensor:
+        written = self.view(observation)
+        written -= 5.0
+        return torch.as_tensor(written)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self.forward(next_tensordict["observation"])
+        return next_tensordict
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+
+def in_data(observation: Tensor) -> Tensor:
+    return observation.data
 
 
 class Pushes(nn.Linear):
@@ -166,6 +192,18 @@ WRONG: dict[str, tuple[Sequence[str], dict[str, Any], type[Exception], str]] = {
         ValueError,
         IS_NOT,
     ),
+    **{
+        f"{who} writes by {view.__name__}": (BOTH, {where: what}, ValueError, IS_NOT)
+        for view in (Tensor.numpy, in_data)
+        for who, where, what in (
+            ("transform", "after", [partial(WritesUncounted, view)]),
+            (
+                "policy",
+                "module",
+                TensorDictModule(WritesUncounted(view), ["observation"], ["other"]),
+            ),
+        )
+    },
     "noise on the observation after": (
         ("transform",),
         {"after": [partial(ObservationNoise, 0.1)]},
@@ -324,12 +362,8 @@ WRONG: dict[str, tuple[Sequence[str], dict[str, Any], type[Exception], str]] = {
         LOST.format(".*'sigma_m'"),
     ),
     "all forgotten by the policy": (
-        ("transform",),
-        {
-            "module": Zeroing(
-                [("l1", name) for name in ("x_hat", "u_bar", "q", "sigma_m", "started", "seal")]
-            )
-        },
+        BOTH,
+        {"module": Zeroing([("l1", name) for name in (*init([], 3, 1).entries(), "seal")])},
         ValueError,
         LOST.format(".*"),
     ),

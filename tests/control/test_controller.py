@@ -25,9 +25,9 @@ from torchrl.envs import (
     StepCounter,
     TransformedEnv,
 )
-from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.modules.utils import get_primers_from_module
-from torchrl.objectives import ClipPPOLoss, SACLoss
+from torchrl.objectives import ClipPPOLoss, DDPGLoss, SACLoss, TD3Loss
 
 from torchrl_l1.control import ActionJacobian, L1Config, L1Controller, L1Transform, init, step
 from torchrl_l1.control.state import state_names
@@ -479,3 +479,16 @@ def test_sac_replays_what_the_policy_chose(kind):
     found = [action.reshape(chosen.shape) for action in seen if action.numel() == chosen.numel()]
     assert any(torch.equal(action, chosen) for action in found)
     assert not any(torch.equal(action, executed) for action in found)
+
+
+@pytest.mark.filterwarnings("ignore:No target network updater:UserWarning")
+@pytest.mark.parametrize("kind", [DDPGLoss, TD3Loss])
+def test_a_loss_is_given_the_actor_alone(kind):
+    controller = L1Controller(make_model(), CONFIG)
+    policy = TensorDictSequential(make_actor(), controller)
+    env = make_env(2, controller.make_primer())
+    data = env.rollout(3, policy).detach()
+    critic = ValueOperator(MLP(5, 1, num_cells=[4]), in_keys=["observation", "action"])
+    options = {} if kind is DDPGLoss else {"action_spec": env.action_spec}
+    with pytest.raises(ValueError, match="give a loss the actor alone"):
+        kind(policy, critic, **options)(data)

@@ -4,8 +4,14 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from tensordict.nn import TensorDictModule
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+)
 from torch import nn
+from torch.distributions import Normal
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_l1.control import (
     ActionJacobian,
@@ -17,6 +23,7 @@ from torchrl_l1.control import (
     augment,
     init,
 )
+from torchrl_l1.control.affine import make_step
 from torchrl_l1.dynamics import EnsembleDynamics
 
 N, M = 5, 3
@@ -293,3 +300,66 @@ def test_an_ensemble_of_another_type_is_named() -> None:
     ) as caught:
         model.prepare(*data(2))
     assert "\n" not in str(caught.value)
+
+
+GLOBAL = nn.Sequential(nn.Linear(4, 8), nn.Dropout(0.5), nn.Linear(8, 3)).eval()
+
+
+class Wrapper(nn.Module):
+    """A model around another one, with a mode of its own."""
+
+    def __init__(self, net: nn.Module) -> None:
+        super().__init__()
+        self.net = net
+        self.eval()
+
+    def forward(self, x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        return self.net(torch.cat([x, u], -1))
+
+    mean_change = forward
+
+
+class Analytic(Wrapper):
+    def value_and_jacobian(self, x: torch.Tensor, u: torch.Tensor):
+        return self(x, u), torch.ones(*x.shape, u.shape[-1])
+
+
+@pytest.mark.parametrize(
+    "wrapped",
+    [
+        Wrapper,
+        Analytic,
+        lambda net: Wrapper(net).mean_change,
+        lambda net: lambda x, u: net(torch.cat([x, u], -1)),
+        lambda _: lambda x, u: GLOBAL(torch.cat([x, u], -1)),
+    ],
+)
+def test_train_mode_behind_another_layer_is_noticed(wrapped):
+    jacobian = ActionJacobian(wrapped(GLOBAL))
+    step = make_step(L1Config(0.05, epsilon=1.0), jacobian, False)
+    x, u = torch.ones(2, 3), torch.ones(2, 1)
+    _, state, _ = step(init([2], 3, 1), x, u)
+    GLOBAL.train()
+    with pytest.raises(ValueError, match=r"is in train mode, in which its layer .*Dropout"):
+        step(state, x, u)
+    GLOBAL.eval()
+    step(state, x, u)
+
+
+def test_a_model_predicts_by_its_own_default_whatever_is_explored():
+    class Gaussian(nn.Linear):
+        def forward(self, x: torch.Tensor, u: torch.Tensor):
+            return super().forward(torch.cat([x, u], -1)), torch.ones_like(x)
+
+    model = ProbabilisticTensorDictSequential(
+        TensorDictModule(Gaussian(4, 3), ["observation", "action"], ["loc", "scale"]),
+        ProbabilisticTensorDictModule(["loc", "scale"], ["delta"], distribution_class=Normal),
+    )
+    jacobian = ActionJacobian(model, out_key="delta")
+    x, u = torch.ones(2, 3), torch.ones(2, 1)
+    jacobian.prepare(x, u)
+    with set_exploration_type(ExplorationType.RANDOM):
+        value, matrix = jacobian(x, u)
+    expected = model.module[0].module(x, u)[0]
+    torch.testing.assert_close(value, expected)
+    torch.testing.assert_close(matrix[0, :, 0], model.module[0].module.weight[:, 3])

@@ -193,7 +193,7 @@ def test_another_controller_beside_it_is_refused(outside: bool) -> None:
         else:
             env.append_transform(OracleTransform())
         name = type(other).__name__
-        with pytest.raises(ValueError, match=f"{name} is there beside OracleTransform"):
+        with pytest.raises(ValueError, match=f"(?=.*{name}).*is there beside"):
             env.reset()
 
 

@@ -9,9 +9,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, OneHot, Unbounded
 from torchrl.envs import (
     ActionScaling,
+    ClipTransform,
     Compose,
     EnvBase,
     FrameSkipTransform,
@@ -168,3 +169,115 @@ def test_actions_in_other_units_than_those_of_the_fit_are_noticed():
 def test_a_second_argument_of_another_type_is_named_and_not_printed():
     with pytest.raises(TypeError, match="L1Config as its second argument, got EnsembleDynamics:"):
         L1Transform(L1Config(0.04), EnsembleDynamics(4, 1, members=2, hidden=(8,)))
+
+
+def controller(**settings: Any) -> L1Controller:
+    return L1Controller(model, **{"observation_dim": 3, "action_dim": 1, **settings})
+
+
+def test_two_controllers_of_one_action_are_refused():
+    transform, other = partial(L1Transform, model), controller(key="other")
+    twins = other.make_primer(), other.make_primer()
+    for first, second, name in (
+        (transform(), transform(key="second"), "L1Transform"),
+        (other.make_primer(), transform(), "(?=.*L1Primer)L1Transform"),
+        (other.make_primer(), controller(key="third").make_primer(), "L1Primer"),
+    ):
+        with pytest.raises(ValueError, match=rf"{name} is there beside .* leave one of them out"):
+            TransformedEnv(pendulum(), Compose(first, second)).reset()
+        outer = TransformedEnv(TransformedEnv(pendulum(), first.clone()), second, auto_unwrap=False)
+        with pytest.raises(ValueError, match=r"is there beside .* leave one of them out"):
+            outer.reset()
+    for allowed in (transform(), Compose(*twins)):  # in another environment, and what one made
+        TransformedEnv(pendulum(), allowed).reset()
+
+
+class Plant(EnvBase):
+    """A plant whose action is as asked."""
+
+    dt = 0.05
+
+    def __init__(self, action_key: str = "action", **keys: Any) -> None:
+        super().__init__()
+        self.observation_spec = Composite(observation=Unbounded((3,)))
+        self.action_spec = Composite({action_key: keys.get("action", Bounded(-1.0, 1.0, (1,)))})
+        self.reward_spec = Unbounded((1,))
+        self.action = action_key
+
+    def _reset(self, tensordict: TensorDict | None, **_: Any) -> TensorDict:
+        return TensorDict(observation=torch.ones(3), done=torch.zeros(1, dtype=torch.bool))
+
+    def _step(self, tensordict: TensorDict) -> TensorDict:
+        observation = tensordict["observation"] + tensordict[self.action].float().sum()
+        return self._reset(None).update({"observation": observation, "reward": torch.zeros(1)})
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("environment", "widths", "message"),
+    [
+        ({"action": OneHot(2)}, {"action_dim": 2}, "vector of floating-point .* is OneHot"),
+        ({"action_key": "act"}, {}, r"no action 'action', only \['act'\]: see action_key"),
+        ({}, {"observation_dim": 2}, "has observation_dim=2, but the environment's has width 3"),
+        ({}, {"action_dim": 2}, "has action_dim=2, but the environment's has width 1"),
+        ({"action": Bounded(-1.0, 1.0, (0,))}, {}, r"of shape \(0,\)"),
+        (
+            {"action": Bounded(torch.tensor([-1.0, 1.0]), torch.ones(2))},
+            {"action_dim": 2},
+            r"low >= high in the entries \[1\].* leave locked actuators out",
+        ),
+    ],
+)
+def test_an_environment_that_does_not_fit_the_controller_is_refused(environment, widths, message):
+    with pytest.raises((KeyError, ValueError), match=message):
+        TransformedEnv(Plant(**environment), controller(**widths).make_primer()).reset()
+
+
+@pytest.mark.parametrize(
+    "make", [partial(L1Transform, model), lambda **settings: controller(**settings).make_primer()]
+)
+def test_a_clip_that_l1_does_not_know_is_warned_of(make):
+    clip = partial(ClipTransform, in_keys=[], in_keys_inv=["action"])
+    with pytest.warns(UserWarning, match=r"ClipTransform cuts off at 0\.6 .* action_high=0\.6"):
+        TransformedEnv(pendulum(), Compose(clip(high=0.6), make())).reset()
+    TransformedEnv(pendulum(), Compose(clip(high=0.6), make(action_high=0.6))).reset()
+    TransformedEnv(pendulum(), Compose(clip(low=-2.0, high=2.0), make())).reset()
+    TransformedEnv(
+        pendulum(), Compose(clip(in_keys=["observation"], in_keys_inv=[], low=0), make())
+    )
+
+
+def test_a_time_step_left_out_is_each_environments_own():
+    l1 = L1Transform(model)
+    env = TransformedEnv(pendulum(), l1)
+    env.reset()
+    twin = l1.clone()
+    TransformedEnv(pendulum(frame_skip=3), twin).reset()
+    assert twin.config.dt == pytest.approx(0.15)
+    env.insert_transform(0, FrameSkipTransform(2))
+    env.reset()
+    assert l1.config.dt == pytest.approx(0.1)
+
+
+def test_one_controller_has_one_time_step():
+    ours = controller()
+    TransformedEnv(pendulum(), ours.make_primer()).reset()
+    TransformedEnv(pendulum(), ours.make_primer()).reset()
+    with pytest.raises(ValueError, match=r"took dt=0\.05 from an environment before, .* 0\.15 s: "):
+        TransformedEnv(pendulum(frame_skip=3), ours.make_primer()).reset()
+
+
+@pytest.mark.parametrize("face", ["transform", "controller"])
+def test_bounds_hold_in_the_actions_type(face):
+    plant = Plant(action=Bounded(-0.1, 0.1, (1,), dtype=torch.float64))
+    ours = controller()
+    transform = L1Transform(model) if face == "transform" else ours.make_primer()
+    env = TransformedEnv(plant, transform)
+    asked = TensorDictModule(
+        lambda _: torch.full((1,), 0.3, dtype=torch.float64), ["observation"], ["action"]
+    )
+    policy = asked if face == "transform" else TensorDictSequential(asked, ours)
+    executed = env.rollout(2, policy)["next", "l1", "u_exec"]
+    assert executed.max() == 0.1 and env.action_spec.is_in(executed[0])

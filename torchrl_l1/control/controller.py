@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import TensorDictPrimer, Transform
@@ -28,12 +28,14 @@ from torchrl_l1.control.layout import (
     declared_dimension,
     entry_name,
     required_entry,
+    vector_spec,
 )
 from torchrl_l1.control.module_model import Predicts
 from torchrl_l1.control.pipeline import (
     Settings,
     carry,
     chain_of,
+    check_alone,
     check_resets,
     leaf_spec,
     unspecified,
@@ -98,6 +100,8 @@ class L1Primer(TensorDictPrimer):
         ValueError: at a reset, if the controller's ``dt`` differs from the environment's.
         KeyError: at a step, if the observation or what the controller wrote is missing.
     """
+
+    controls = True
 
     def __init__(
         self,
@@ -164,7 +168,8 @@ class L1Primer(TensorDictPrimer):
         if is_there and not self._has_a_twin():
             raise ValueError(
                 f"the environment already has entries under {self.key!r}, of another controller or "
-                "primer: leave one of them out, or give L1Controller its own key"
+                "primer: leave one of them out or, if it controls another action, give "
+                "L1Controller its own key"
             )
         output_spec = super().transform_output_spec(output_spec)
         observation_spec = output_spec["full_observation_spec"]
@@ -176,7 +181,10 @@ class L1Primer(TensorDictPrimer):
         """Whether another primer of this controller comes first, such as one a collector added."""
         chain = chain_of(self)
         before = chain[: next(index for index, member in enumerate(chain) if member is self)]
-        return any(isinstance(x, L1Primer) and x._shared is self._shared for x in before)
+        return any(map(self._is_twin, before))
+
+    def _is_twin(self, other: nn.Module) -> bool:
+        return isinstance(other, L1Primer) and other._shared is self._shared
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         nested = next_tensordict.get(self.key, None)
@@ -233,19 +241,34 @@ class L1Primer(TensorDictPrimer):
         if self._is_checked or environment is None:
             return
         check_resets("L1Controller", environment)
-        config = self._shared.settings.complete(environment)
+        check_alone(self, environment, self._is_twin)
+        action = vector_spec(environment, "action", self.action_key)
+        observation = vector_spec(self.parent, "observation", self.observation_key)
+        layout = self._layout
+        for name, width, spec in (
+            ("observation_dim", layout.observation_dim, observation),
+            ("action_dim", layout.action_dim, action),
+        ):
+            if spec.shape[-1] != width:
+                raise ValueError(
+                    f"L1Controller has {name}={width}, but the environment's has width "
+                    f"{spec.shape[-1]}"
+                )
+        settings = self._shared.settings
+        config = settings.complete(environment, is_shared=True)
         if self.check_dt:
-            check_time_step("L1Controller", config.dt, environment)
+            check_time_step("L1Controller", config.dt, environment, was_given=settings.has_dt)
         try:
-            spec = action_bounds(environment.full_action_spec[self.action_key])
+            told = action_bounds(action)
         except ValueError:  # of environments with different ones
             if config.action_low is None or config.action_high is None:
                 raise
-            spec = None, None
+            told = None, None
         bounds = config.action_low, config.action_high
-        warn_of_surroundings("L1Controller", environment, self.observation_key, bounds, spec)
+        keys = self.observation_key, self.action_key
+        warn_of_surroundings("L1Controller", environment, *keys, bounds, told)
         if None in bounds:
-            self._shared.learn(*spec)
+            self._shared.learn(*told)
         self._is_checked = True
 
 
@@ -427,10 +450,17 @@ class L1Controller(TensorDictModuleBase):
             owner="L1Controller",
             remedy="append the primer to the environment, "
             "TransformedEnv(env, controller.make_primer())",
+            config=self.config,
             check=self.check,
             emitted=self._environment.emitted,
             seal_is_required=False,
         )
+        is_rollout = ahead.seal is not None or tensordict.get((self.key, SEAL), None) is not None
+        if is_eager and not is_rollout and ahead.u_rl.requires_grad and torch.is_grad_enabled():
+            raise ValueError(
+                "no gradient flows through L1Controller, and here is none of its primer's data: "
+                "give a loss the actor alone, or act under torch.no_grad()"
+            )
         if is_eager:
             environment.sent = ahead.executed
         tensordict.set((self.key, "u_rl"), ahead.u_rl)

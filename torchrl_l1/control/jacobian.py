@@ -20,6 +20,7 @@ from torchrl_l1.control.probe import (
     failure,
     probe,
     refuse_training,
+    watched,
 )
 from torchrl_l1.control.state import ResidualStatistics
 
@@ -132,7 +133,7 @@ class ActionJacobian:
         self.predicts: Predicts = predicts or "change"
         self._mode: Mode | None = None
         self._lifted = False
-        self._training: object = None
+        self._training: list[tuple[nn.Module, bool]] = []
         if not self.analytic:
             _load_forward_mode()
 
@@ -158,8 +159,7 @@ class ActionJacobian:
     @property
     def ready(self) -> bool:
         """Whether the model has been checked and not changed mode since."""
-        training = getattr(self.dynamics, "training", None)
-        return self._mode is not None and training is self._training
+        return self._mode is not None and all(x.training is mode for x, mode in self._training)
 
     def prepare(self, observation: Tensor, action: Tensor) -> None:
         """Check the model before its first use, and after ``train()`` and ``eval()``.
@@ -182,7 +182,7 @@ class ActionJacobian:
         with FORWARD_MODE:
             if self.ready or observation.shape[:-1].numel() == 0:
                 return
-            training = getattr(self.dynamics, "training", None)
+            training = [(layer, layer.training) for layer in watched(self.dynamics)]
             modes: dict[Mode, Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]]
             if self.analytic:
                 modes = {"analytic": self._analytically}
@@ -276,7 +276,7 @@ class ActionJacobian:
         return value, jacobian
 
     def _differentiates(self, observation: Tensor, action: Tensor) -> Mode:
-        if not self.ready and not _is_traced():
+        if not _is_traced() and not self.ready:
             self.prepare(observation, action)
         return self._mode or "forward"
 

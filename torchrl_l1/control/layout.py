@@ -19,6 +19,7 @@ from torchrl_l1.control.config import L1Config, Scalars, with_open_bounds
 from torchrl_l1.control.jacobian import ActionJacobian, ChangeFunction, DynamicsModel
 from torchrl_l1.control.module_model import Predicts
 from torchrl_l1.control.seal import SEAL, Emitted, seal_width, verify
+from torchrl_l1.control.signals import saturate
 from torchrl_l1.control.state import L1Diagnostics, L1State, init
 
 L1_KEY = "l1"
@@ -77,8 +78,8 @@ class Layout:
             KeyError: if the environment has no such observation or action.
             ValueError: if they are not vectors of floating-point numbers.
         """
-        observation = _vector_spec(env, "observation", observation_key)
-        action = _vector_spec(env, "action", action_key)
+        observation = vector_spec(env, "observation", observation_key)
+        action = vector_spec(env, "action", action_key)
         low, high = action_bounds(action)
         return cls(
             batch_size=env.batch_size,
@@ -150,7 +151,18 @@ def pack(
     return TensorDict._new_unsafe(entries, batch_size=torch.Size(batch_size), device=device)
 
 
-def _vector_spec(env: EnvBase, kind: str, key: NestedKey) -> TensorSpec:
+def vector_spec(env: EnvBase, kind: str, key: NestedKey) -> TensorSpec:
+    """Spec of the observation or action, if it is a vector of floating-point numbers.
+
+    Args:
+        env: the environment.
+        kind: ``"observation"`` or ``"action"``.
+        key: of it.
+
+    Raises:
+        KeyError: if there is none under that key.
+        ValueError: if it is something else.
+    """
     specs = env.full_observation_spec if kind == "observation" else env.full_action_spec
     if key not in specs.keys(include_nested=True, leaves_only=True):
         found = sorted(map(str, specs.keys(include_nested=True, leaves_only=True)))
@@ -158,7 +170,7 @@ def _vector_spec(env: EnvBase, kind: str, key: NestedKey) -> TensorSpec:
     spec = specs[key]
     is_continuous = kind == "observation" or isinstance(spec, (Bounded, Unbounded))
     is_vector = spec.dtype.is_floating_point and spec.ndim == len(env.batch_size) + 1
-    if not (is_continuous and is_vector):
+    if not (is_continuous and is_vector and spec.shape[-1] > 0):
         raise ValueError(
             f"L1 needs a vector of floating-point numbers as {kind} {key!r}, but its spec is "
             f"{type(spec).__name__} of shape {tuple(spec.shape)} and type {spec.dtype}"
@@ -170,7 +182,7 @@ def action_bounds(action: TensorSpec) -> tuple[Scalars | None, Scalars | None]:
     """Bounds of an action spec; ``None`` if it has none.
 
     Raises:
-        ValueError: if the environments of a batch have different bounds.
+        ValueError: if the environments of a batch have different bounds, or no room between them.
     """
     if not isinstance(action, Bounded):
         return None, None
@@ -182,6 +194,12 @@ def action_bounds(action: TensorSpec) -> tuple[Scalars | None, Scalars | None]:
         raise ValueError(
             "the environments have different action bounds: give L1 the bounds to use as "
             "action_low and action_high"
+        )
+    locked = (low[0] >= high[0]).nonzero().flatten().tolist()
+    if locked:
+        raise ValueError(
+            f"the action spec has low >= high in the entries {locked}, where L1 has nothing to "
+            "choose: leave locked actuators out of the action"
         )
     return _scalars(low[0]), _scalars(high[0])
 
@@ -252,6 +270,7 @@ def advance(
     *,
     owner: str,
     remedy: str,
+    config: L1Config,
     check: bool = True,
     emitted: Emitted | None = None,
     seal_is_required: bool = True,
@@ -267,6 +286,7 @@ def advance(
         key: key of the nested tensordict with the state.
         owner: name of the reading class, for errors.
         remedy: what to do if there is no state.
+        config: the settings of the step.
         check: whether observation and state must be those that were sealed.
         emitted: what was sealed last.
         seal_is_required: whether a seal must be present.
@@ -323,7 +343,8 @@ def advance(
         )
     with torch.no_grad():
         executed, state, signals = step(state, observation.to(dtype), action.to(dtype))
-    executed = executed.to(action.dtype)
+    if executed.dtype != action.dtype:  # in which the bounds may be other numbers
+        executed = saturate(config, executed.to(action.dtype))
     following = pack(executed, state, signals, tensordict.batch_size, tensordict.device)
     return Advanced(action, executed, following, state, seal)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, set_interaction_type
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
@@ -44,7 +44,8 @@ def _prediction_key(
     if unknown or len(module.in_keys) != 2:
         raise ValueError(
             f"the dynamics module reads {module.in_keys}; it must read exactly "
-            f"{observation_key!r} and {action_key!r} (see observation_key and action_key)"
+            f"{observation_key!r} and {action_key!r}: see observation_key and action_key; one with "
+            "keys of its own is given to L1 as ActionJacobian(module, observation_key=...)"
         )
     if out_key is None:
         if len(module.out_keys) != 1:
@@ -84,6 +85,8 @@ def _on_tensors(
     action_key: NestedKey,
     out_key: NestedKey,
 ) -> ChangeFunction:
+    # Its own default, whatever a collector sets for the policy.
+    @set_interaction_type(None)
     def predict(observation: Tensor, action: Tensor) -> Tensor:
         data = TensorDict({}, batch_size=observation.shape[:-1])
         data.set(observation_key, observation)

@@ -20,10 +20,8 @@ from torchrl.envs.transforms import (
     Transform,
 )
 
-from torchrl_l1.control.controller import L1Primer
 from torchrl_l1.control.layout import L1_KEY, entry_name, required_entry
-from torchrl_l1.control.pipeline import action_keys, transforms_of
-from torchrl_l1.control.transform import L1Transform
+from torchrl_l1.control.pipeline import action_keys, check_alone, transforms_of
 
 
 class OracleTransform(Transform):
@@ -73,6 +71,8 @@ class OracleTransform(Transform):
         >>> torch.equal(data["next", "l1", "u_exec"], executed)
         True
     """
+
+    controls = True
 
     def __init__(self, action_key: NestedKey = "action", key: str = L1_KEY) -> None:
         super().__init__()
@@ -175,14 +175,7 @@ class OracleTransform(Transform):
 
     def _check_surroundings(self) -> None:
         environment = self._environment()
-        for transform in transforms_of(environment):
-            is_controller = isinstance(transform, CONTROLLERS)
-            is_other = is_controller and transform is not self
-            if is_other and _has_key(transform, "action_key", self.action_key):
-                raise ValueError(
-                    f"{type(transform).__name__} is there beside OracleTransform, and both would "
-                    "act against the same disturbance: leave one of them out"
-                )
+        check_alone(self, environment)
         while isinstance(environment, TransformedEnv):
             environment = environment.base_env
         members = environment.__dict__.get("_envs", []) if type(environment) is SerialEnv else []
@@ -199,10 +192,6 @@ class OracleTransform(Transform):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(key={self.key!r})"
-
-
-CONTROLLERS = (L1Primer, L1Transform, OracleTransform)
-"""Transforms that act against disturbances, of which any two would interfere."""
 
 
 def _has_key(transform: nn.Module, name: str, key: NestedKey) -> bool:

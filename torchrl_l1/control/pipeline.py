@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -16,6 +16,7 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import (
     ActionScaling,
+    ClipTransform,
     Compose,
     ConditionalPolicySwitch,
     DeviceCastTransform,
@@ -101,6 +102,28 @@ def check_resets(owner: str, env: EnvBase) -> None:
             f"{owner} restarts on a root '_reset', but this environment resets by "
             f"{env.reset_keys} only: give it a 'done' at its root with the shape of its batch"
         )
+
+
+def check_alone(
+    own: Transform, env: EnvBase, is_twin: Callable[[nn.Module], bool] = lambda other: False
+) -> None:
+    """Reject another controller of the same action: transforms with an attribute ``controls``.
+
+    Args:
+        own: the controller that asks, with an ``action_key``.
+        env: the environment around it.
+        is_twin: whether a transform belongs to the same controller.
+
+    Raises:
+        ValueError: naming both.
+    """
+    for other in transforms_of(env):
+        is_other = getattr(other, "controls", False) and other is not own and not is_twin(other)
+        if is_other and other.action_key == own.action_key:
+            raise ValueError(
+                f"{type(other).__name__} is there beside {type(own).__name__}, and both would act "
+                f"against the same disturbance of {own.action_key!r}: leave one of them out"
+            )
 
 
 def check_order(
@@ -249,17 +272,21 @@ class Settings:
         if unknown:
             raise TypeError(f"{owner} got unknown settings {unknown}; L1Config has {sorted(known)}")
         self._others = dict(others)
-        self.is_complete = config is not None or dt is not None
+        self.has_dt = self.is_complete = config is not None or dt is not None
         # Without a time step, everything that does not depend on it is checked now.
         self.config = config or L1Config(_SHORT if dt is None else dt, **others)
 
-    def complete(self, env: EnvBase) -> L1Config:
+    def complete(self, env: EnvBase, *, is_shared: bool = False) -> L1Config:
         """The configuration, with the environment's time step if none was given.
+
+        Args:
+            env: the environment.
+            is_shared: whether the time step of an environment before it stays.
 
         Raises:
             ValueError: if the environment does not declare it.
         """
-        if not self.is_complete:
+        if not self.has_dt and not (is_shared and self.is_complete):
             dt = time_step(env)
             if dt is None:
                 raise ValueError(
@@ -294,6 +321,7 @@ def warn_of_surroundings(
     owner: str,
     env: EnvBase,
     observation_key: NestedKey,
+    action_key: NestedKey,
     bounds: tuple[Scalars | None, Scalars | None],
     spec: tuple[Scalars | None, Scalars | None],
 ) -> None:
@@ -303,11 +331,13 @@ def warn_of_surroundings(
         owner: name of the class.
         env: the environment up to L1.
         observation_key: of the observation.
+        action_key: of the action.
         bounds: lower and upper action bound in the settings.
         spec: those of the action's spec.
 
     Warns:
-        UserWarning: about bounds beyond the spec's, and about a normaliser whose statistics change.
+        UserWarning: about bounds beyond the spec's or a ``ClipTransform``'s, and about a normaliser
+            whose statistics change.
     """
     for name, sign, given, told in zip(
         ("action_low", "action_high"), (-1, 1), bounds, spec, strict=True
@@ -320,6 +350,20 @@ def warn_of_surroundings(
                 UserWarning,
                 stacklevel=3,
             )
+    assumed = [told if given is None else given for given, told in zip(bounds, spec, strict=True)]
+    for clip in () if scales_actions(env) else transforms_of(env):
+        if not isinstance(clip, ClipTransform) or action_key not in clip.in_keys_inv:
+            continue
+        for name, sign, known, end in zip(
+            ("action_low", "action_high"), (-1, 1), assumed, (clip.low, clip.high), strict=True
+        ):
+            if end is not None and (known is None or _is_beyond(known, float(end), sign)):
+                warnings.warn(
+                    f"ClipTransform cuts off at {float(end):.6g} what {owner} sends, without its "
+                    f"knowledge: give {owner} {name}={float(end):.6g}",
+                    UserWarning,
+                    stacklevel=3,
+                )
     normaliser = _running_normaliser(env, observation_key)
     if normaliser is not None:
         warnings.warn(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dis
 import functools
 import os
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from types import FunctionType
 from typing import Literal
 
 import torch
@@ -224,6 +226,13 @@ def refuse_training(dynamics: object) -> None:
                 )
 
 
+def watched(dynamics: object) -> list[nn.Module]:
+    """Modules of which a change of mode may matter: outermost ones, and those refused in train."""
+    roots = list(_modules(dynamics))
+    layers = [layer for root in roots for layer in root.modules() if _needs_eval(layer)]
+    return [one for one in (*roots, *layers) if hasattr(one, "training")]
+
+
 def _needs_eval(layer: nn.Module) -> bool:
     if isinstance(layer, _RANDOM):
         return getattr(layer, "p", 1.0) > 0
@@ -250,6 +259,11 @@ def _modules(dynamics: object) -> Iterator[nn.Module]:
         for cell in getattr(dynamics, "__closure__", None) or ():
             with suppress(ValueError):  # an empty cell
                 held.append(cell.cell_contents)
+        if isinstance(dynamics, FunctionType):
+            names = (
+                one.argval for one in dis.get_instructions(dynamics) if one.opname == "LOAD_GLOBAL"
+            )
+            held += [dynamics.__globals__.get(name) for name in names]
         yield from (part for part in held if isinstance(part, nn.Module))
 
 

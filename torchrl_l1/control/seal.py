@@ -71,13 +71,18 @@ class Emitted(NamedTuple):
         return cls(observation, state, seal, _versions(observation, state))
 
     def is_what_is_read(self, observation: Tensor, state: L1State, seal: Tensor) -> bool:
-        """Whether these are the very tensors emitted, not written to since; launches no kernel."""
+        """Whether these are the very tensors emitted, not written to since.
+
+        On a CPU the observation's values are compared too, since writes through ``numpy()`` or
+        ``data`` do not count; elsewhere that would wait for the device.
+        """
         return (
             observation is self.observation
             and seal is self.seal
             and all(a is b for a, b in zip(state, self.state, strict=True))
             and self.versions is not None
             and self.versions == _versions(observation, state)
+            and (not observation.is_cpu or _holds(seal, observation))
         )
 
 
@@ -102,7 +107,8 @@ def verify(
         observation_key: where it reads the observation.
         key: where it reads state and seal.
         emitted: what it sealed last, if it remembers.
-        zero_is_none: whether a row of zeros counts as no seal.
+        zero_is_none: whether a row of zeros counts as no seal, unless its observation is the one
+            that was sealed last.
 
     Raises:
         ValueError: naming the observation's key or the state's entries.
@@ -143,20 +149,24 @@ def _compare(
         terms = found if state is None else torch.cat(state.memory(), -1)
         scale = terms.abs().sum(-1).nan_to_num()
         differs[..., -1] &= (found - seal)[..., -1].abs() > 10 * _TOLERANCE * scale
+    # If the observation is right, the seal is old or lost, and the state with it.
+    is_right = torch.zeros_like(differs[..., 0])
+    if emitted is not None and emitted.seal.shape == found.shape:
+        is_right = _close(found[..., :n], emitted.seal[..., :n].to(found.dtype)).all(-1)
     if zero_is_none:
-        differs = differs & (seal != 0).any(-1, keepdim=True)
+        differs = differs & ((seal != 0).any(-1) | is_right).unsqueeze(-1)
     if not differs.any():
         return
-    changed = differs[..., :n].any(-1)
-    if emitted is not None and emitted.seal.shape == found.shape and changed.any():
-        # If the observation is right, the seal is old, and the state with it.
-        same = _close(found[..., :n], emitted.seal[..., :n].to(found.dtype))
-        changed = changed & ~same.all(-1)
+    changed = differs[..., :n].any(-1) & ~is_right
     if changed.any():
         raise ValueError(_of_observation(found, seal, changed, owner, observation_key, n))
     widths = [n, n, m, m, m, 1, 1] + [1] * has_memory
     parts = [bool(part.any()) for part in differs.split(widths, -1)[1:]]
     raise ValueError(_of_state(owner, key, _lost(parts, state, emitted)))
+
+
+def _holds(seal: Tensor, observation: Tensor) -> bool:
+    return torch.equal(observation.to(seal.dtype), seal.narrow(-1, 0, observation.shape[-1]))
 
 
 def _close(found: Tensor, seal: Tensor) -> Tensor:

@@ -93,14 +93,25 @@ def _number(value: Any) -> float | None:
     return number if math.isfinite(number) and number > 0 else None
 
 
-def check_time_step(owner: str, dt: float, env: EnvBase) -> None:
+def check_time_step(owner: str, dt: float, env: EnvBase, *, was_given: bool = True) -> None:
     """Reject a ``dt`` that differs from the environment's, if that declares its own.
+
+    Args:
+        owner: name of the class with the ``dt``.
+        dt: in seconds.
+        env: the environment.
+        was_given: whether the ``dt`` was given, and not that of another environment.
 
     Raises:
         ValueError: naming both.
     """
     told = time_step(env)
     if told is not None and abs(dt - told) > _TOLERANCE * told:
+        if not was_given:
+            raise ValueError(
+                f"{owner} took dt={dt:.6g} from an environment before, but a step of this one "
+                f"takes {told:.6g} s: make one {owner} for each time step"
+            )
         raise ValueError(
             f"{owner} has dt={dt:.6g}, but a step of the environment takes {told:.6g} s: leave dt "
             "out, give that value, or give check_dt=False if the environment is wrong"

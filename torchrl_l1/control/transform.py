@@ -29,6 +29,7 @@ from torchrl_l1.control.module_model import Predicts
 from torchrl_l1.control.pipeline import (
     Settings,
     carry,
+    check_alone,
     check_order,
     check_resets,
     scales_actions,
@@ -131,6 +132,8 @@ class L1Transform(Transform):
         (torch.Size([4, 1]), torch.Size([4, 1]))
     """
 
+    controls = True
+
     def __init__(
         self,
         dynamics: Dynamics,
@@ -214,7 +217,8 @@ class L1Transform(Transform):
         if observation_spec.get(self.key, None) is not None:
             raise ValueError(
                 f"the environment already has entries under {self.key!r}, of another controller? "
-                "Give L1Transform its own key"
+                "Leave one of them out or, if it controls another action, give L1Transform its own "
+                "key"
             )
         layout = self._resolve()
         observation_spec[self.key] = layout.spec(self._settings.config, self.diagnostics)
@@ -245,7 +249,7 @@ class L1Transform(Transform):
                 "L1Transform is applied again to its own output: a transform after it repeats the "
                 "step, as FrameSkipTransform does; it must come before L1Transform in Compose"
             )
-        assert self._step_function is not None
+        assert self._step_function is not None and self._step_config is not None
         ahead = advance(
             self._step_function,
             self._state_names,
@@ -255,6 +259,7 @@ class L1Transform(Transform):
             self.key,
             owner="L1Transform",
             remedy="reset the environment first and pass on what reset or step_mdp returned",
+            config=self._step_config,
             check=self.check,
             emitted=self._last.emitted,
         )
@@ -330,7 +335,7 @@ class L1Transform(Transform):
         if lacking:
             raise ValueError(
                 f"a batched environment would lose {lacking} of L1Transform, which a later "
-                f"transform removes from the specs: add {self.key!r} to its SelectTransform"
+                f"transform removes from the specs: let it keep {self.key!r} and all that is in it"
             )
 
     def _fresh(self, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -376,12 +381,14 @@ class L1Transform(Transform):
             return
         layout, parent = self._resolve(), self.parent
         check_resets("L1Transform", parent)
+        check_alone(self, self.container)
         config = self._settings.complete(parent)
         if self.check_dt:
             check_time_step("L1Transform", config.dt, parent)
         bounds = config.action_low, config.action_high
         spec = layout.low, layout.high
-        warn_of_surroundings("L1Transform", parent, self.observation_key, bounds, spec)
+        keys = self.observation_key, self.action_key
+        warn_of_surroundings("L1Transform", parent, *keys, bounds, spec)
         config = layout.bounded(config)
         limits, scaled = (config.action_low, config.action_high), scales_actions(parent)
         warn_of_action_units(self.model.dynamics, *limits, scaled)

@@ -22,7 +22,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.utils import get_primers_from_module
 
 from torchrl_l1.algorithms.collection import seed_streams, stream_seed
-from torchrl_l1.control.oracle import CONTROLLERS
 from torchrl_l1.control.pipeline import transforms_of
 from torchrl_l1.dynamics import EnsembleDynamics, read_transitions
 from torchrl_l1.dynamics.transitions import check_time_step
@@ -215,7 +214,7 @@ def check_surroundings(env: EnvBase) -> None:
         ValueError: naming it.
     """
     for transform in transforms_of(env):
-        if isinstance(transform, CONTROLLERS):
+        if getattr(transform, "controls", False):
             raise ValueError(
                 f"the environment already has {type(transform).__name__}, and a second controller "
                 "would act beside it: give the environment without it"
