@@ -446,7 +446,7 @@ def test_two_faces_under_one_name_are_refused() -> None:
     for chain in ((l1(), ours.make_primer()), (controller().make_primer(), ours.make_primer())):
         with pytest.raises(
             ValueError,
-            match=r"already has entries under 'l1', of another controller or primer|is there beside",
+            match=r"already has entries under 'l1', of another controller|is there beside",
         ):
             TransformedEnv(pendulum(), Compose(*chain)).reset()
     # Collectors may add a second primer of one controller.
