@@ -351,8 +351,7 @@ def test_what_a_controller_that_hardly_acts_changes_is_quoted() -> None:
 
 
 DISTURBANCES = {
-    "actuator delay": "delays",
-    "sensor delay": "delays",
+    **dict.fromkeys(("actuator delay", "sensor delay"), "delays"),
     "sensor bias": "offset of the sensors",
     "body mass": "heavier bodies",
     "wind force": "in wind",
@@ -399,27 +398,22 @@ def test_suite_page_quotes_its_tables() -> None:
     assert [pair for pair in quoted if not in_a_table(*pair)] == []
 
 
-def test_suite_page_quotes_what_the_record_of_forecasts_changes(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_suite_page_quotes_what_the_record_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     suite = script("suite", monkeypatch)
     text = section("docs/studies/suite.md", "## What the record").partition("## Why")[0]
-    delays = " ".join(
-        text.partition("Under actuator delays")[2].partition("Undisturbed")[0].split()
-    )
+    delays = text.partition("Under actuator delays")[2].partition("Undisturbed")[0]
 
     def mean(task: str, l1: str, disturbance: str) -> str:
-        returns = {key: of for key, of in suite.read(task).items() if key[0] == "seed_0"}
-        cells = suite.groups_of(returns).get(disturbance, [suite.NONE])
-        return f"{suite.by_reset(returns, l1, cells).mean():.0f}"
+        cells = suite.groups_of(suite.read(task)).get(disturbance, [suite.NONE])
+        return f"{suite.by_reset(suite.read(task), l1, cells).mean():.0f}"
 
     for task in TASKS[1:]:
         name = task.title().replace("_", "")
         told = re.search(rf"{name} (?:returns )?(\S+) .*?and (\S+)[^(]*\((\S+?)[ )]", delays)
         every = tuple(mean(task, l1, "delay") for l1 in ("whole", "robust", "off"))
         assert told is not None and told.groups() == every, task
-    whole, scaled, off = (mean("half_cheetah", l1, "none") for l1 in ("whole", "robust", "off"))
-    assert f"HalfCheetah returns {whole} and {scaled} ({off})" in text
+    told = [mean("half_cheetah", l1, "none") for l1 in ("whole", "robust", "off")]
+    assert "HalfCheetah returns {} and {} ({})".format(*told) in text
 
 
 def test_theorem_page_quotes_the_residuals_of_the_tasks() -> None:
