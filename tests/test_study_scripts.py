@@ -163,7 +163,8 @@ CONFIG = L1Config.robust(0.02, action_low=-1.0, action_high=1.0)
 def test_robust_controllers_act_by_the_rule_of_a_study(monkeypatch: pytest.MonkeyPatch) -> None:
     acting = script("acting", monkeypatch)
     known = Posterior(torch.full((1, 1), 0.1), torch.ones(1, 1, 1))  # within the dead zone
-    estimated = kalman_law.Estimate(known, *[torch.zeros(1, 1)] * 5)
+    zero = torch.zeros(1, 1)
+    estimated = kalman_law.Estimate(known, zero, None, *[zero] * 4)
 
     def correction() -> float:
         return float(kalman_law.adapted(CONFIG, estimated, torch.zeros(1, 1)).q)
