@@ -13,7 +13,7 @@ PYTEST_ARGS ?= -n auto --dist worksteal
 BENCH_ARGS ?=
 # Scripts of docs/results that write tables and figures from data that are committed there.
 STUDIES := acting any_task fit_quality hopper in_the_loop learned_rewards mbrl_cartpole offline \
-    planners precision questions robust suite trained_twice
+    planners precision questions record robust suite trained_twice
 
 export MPLBACKEND ?= Agg
 export PIP_DISABLE_PIP_VERSION_CHECK ?= 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import shutil
 import sys
 from collections.abc import Callable, Sequence
@@ -17,7 +18,7 @@ import torch
 from matplotlib.figure import Figure
 from scipy.stats import ttest_1samp
 
-from tests.test_studies import RESULTS, script
+from tests.test_studies import RESULTS, ROOT, rows, script
 from torchrl_l1.algorithms.collection import ORACLE, make_pipeline
 from torchrl_l1.control import L1Config, kalman_law
 from torchrl_l1.control.kalman import Posterior
@@ -173,6 +174,19 @@ def test_robust_controllers_act_by_the_rule_of_a_study(monkeypatch: pytest.Monke
     with acting.acting_by(lambda posterior: 3 * posterior.mean):
         assert correction() == pytest.approx(0.3)
     assert correction() == 0
+
+
+def test_what_the_record_of_forecasts_changes_on_other_policies_is_counted() -> None:
+    cells = rows((RESULTS / "record.md").read_text())
+    changes = [re.findall(r"-?[\d.]+(?:e\+\d+)?", cell["change"]) for cell in cells]
+    assert all(float(high) > 0 for _, _, high in changes)  # none is worse
+    late = [
+        change for cell, change in zip(cells, changes, strict=True) if "late" in cell["disturbance"]
+    ]
+    better = sum(float(mean) > 0 for mean, *_ in late)
+    surely = sum(float(low) > 0 for _, low, _ in late)
+    text = f"{better} of the {len(late)} cells with delays are better with the record, {surely} of"
+    assert text in (ROOT / "docs/studies/suite.md").read_text()
 
 
 def test_what_a_study_puts_in_place_of_the_shipped_controller_acts(
