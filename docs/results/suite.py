@@ -8,7 +8,7 @@ FOLDER is given, and keeps their returns in `suite/TASK.csv` beside this file, i
 the same policy and controller; with `whole` those of the robust controller alone, as that which
 acts on its whole estimate. Writes from those `suite/TASK.md`, one row per disturbance,
 `suite/TASK_values.md`, one row per value of it, `suite/verdicts.md` and `.png`, disturbances by
-tasks, and `suite/record.md`, what the robust controller's record of its forecasts changes.
+tasks, and `suite/changed.md`, what the robust controller's record of its forecasts changes.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ def groups_of(returns: Returns) -> dict[str, list[Cell]]:
     return {name: cells for name, cells in groups.items() if cells}
 
 
-def record(of: dict[str, Returns]) -> str:
+def changed_by_record(of: dict[str, Returns]) -> str:
     """Verdicts on the robust controller that its record of forecasts changes: without / with."""
     of = {task: every for task, every in of.items() if any(key[1] == WHOLE for key in every)}
     lines = []
@@ -273,7 +273,7 @@ def main() -> None:
             verdicts = [verdict(returns, l1, cells) for l1 in ("paper", "robust") if cells]
             line[column] = " / ".join(verdicts) or "–"
     (HERE / "verdicts.md").write_text(markdown(list(words.values())) + "\n")
-    (HERE / "record.md").write_text(record(of) + "\n")
+    (HERE / "changed.md").write_text(changed_by_record(of) + "\n")
     plot(of, HERE / "verdicts.png")
     print(f"Tables and figure: {HERE}")
 
