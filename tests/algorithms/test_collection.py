@@ -133,6 +133,7 @@ def test_signals_are_summed_up_as_their_words_say() -> None:
     signals = {
         "switch": column(yes, no, no, no, no, yes),
         "saturation": column(0.0, 0.5, 1.0, 0.0, 0.0, 0.0),
+        "forecast_skill": column(1.0, 1.0, 0.5, 1.0, 1.0, 0.0),
         "ill_conditioned": column(no, no, no, yes, no, no),
         "non_finite": column(no, yes, no, yes, yes, no),
     }
@@ -146,6 +147,7 @@ def test_signals_are_summed_up_as_their_words_say() -> None:
         "non_finite_steps": 2,
         "l1/switch_rate": 1 / 3,
         "l1/saturation": 0.25,
+        "l1/forecast_skill": 0.75,
         "l1/ill_conditioned": 1 / 6,
         "l1/non_finite": 3,
     }

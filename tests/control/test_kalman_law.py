@@ -111,11 +111,16 @@ def test_a_lasting_disturbance_is_acted_on_and_one_that_outruns_the_estimate_is_
         zero, x, acted = torch.zeros(2, dtype=torch.float64), torch.zeros(2).double(), []
         jacobian = torch.tensor([[0.5], [0.2]], dtype=torch.float64)
         for t in range(600):
-            u, state, _ = step(config, state, x, zero[:1], zero, jacobian, residuals=statistics)
+            u, state, signals = step(
+                config, state, x, zero[:1], zero, jacobian, residuals=statistics
+            )
             sign = 1.0 if period is None or t % period < period // 2 else -1.0
             x = x + jacobian @ (u + 0.4 * sign) + 0.01 * torch.as_tensor(rng.normal(size=2))
             acted.append(state.q.abs().item())
         found[forgetting] = np.mean(acted[300:])
+        gained, promised = (10.0, 10.0) if state.skill is None else (state.skill + 10).tolist()
+        share = min(max(gained / promised, 0.0), 1.0)
+        assert signals.forecast_skill.item() == pytest.approx(share)
     assert low <= found[0.99] / found[1.0] <= high
     assert found[1.0] > 0.2
 
@@ -150,6 +155,7 @@ def test_the_diagnostics_are_those_of_the_estimate():
         "u_a": np.linalg.norm(acted),
         "posterior_deviation": variance.sum() ** 0.5,
         "significance": (abs(mean) / variance**0.5).max(),
+        "forecast_skill": 1.0,
     }.items():
         assert getattr(found, name).item() == pytest.approx(value), name
 

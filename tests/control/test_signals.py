@@ -23,6 +23,7 @@ def test_the_diagnostics_of_a_step_by_hand():
         non_finite=flag,
         dtype=torch.float32,
         posterior=Posterior(torch.tensor([1.0, -3.0]), torch.diag(torch.tensor([0.04, 0.25]))),
+        skill=torch.tensor([20.0, 50.0]),
     )
     found = diagnose(L1Config(0.05), terms, affinization_error=torch.tensor([0.7]))
     assert {name: value.item() for name, value in found._asdict().items()} == pytest.approx(
@@ -38,5 +39,6 @@ def test_the_diagnostics_of_a_step_by_hand():
             "non_finite": False,
             "posterior_deviation": 0.29**0.5,
             "significance": 6.0,
+            "forecast_skill": (20 + 10) / (50 + 10),
         }
     )

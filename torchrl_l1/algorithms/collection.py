@@ -49,6 +49,8 @@ L1_METRICS: dict[str, str] = {
     "l1/u_a": "Mean norm of the adaptive input, action units.",
     "l1/u_a_max": "Largest such norm.",
     "l1/saturation": "Share of action entries cut by a bound.",
+    "l1/forecast_skill": "Mean share of its estimate that a controller with a record of forecasts "
+    "acts on; 1 without.",
     "l1/ill_conditioned": "Share of steps with a rank-deficient or ill-conditioned Jacobian.",
     "l1/non_finite": "Steps on which an input of L1 was not finite, so that L1 did not act.",
 }
@@ -57,6 +59,7 @@ L1_METRICS: dict[str, str] = {
 _L1_MEANS = {
     "switch": "switch_rate",
     "saturation": "saturation",
+    "forecast_skill": "forecast_skill",
     "ill_conditioned": "ill_conditioned",
 }
 _L1_MEANS_AND_MAXIMA = ("affinization_error", "prediction_error", "matched", "unmatched", "u_a")

@@ -289,6 +289,7 @@ def follow(
         non_finite,
         dtype,
         posterior,
+        estimated.skill,
     )
     u = torch.where(finite, narrow(u, policy.dtype), policy)
     return u, narrow_entries(following, dtype), terms

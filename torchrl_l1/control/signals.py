@@ -150,6 +150,7 @@ class Terms(NamedTuple):
         non_finite: an input was not finite, or not believed ``(..., 1)``, bool.
         dtype: type of the state.
         posterior: posterior of the matched disturbance, with a Kalman filter.
+        skill: sums of :func:`~torchrl_l1.control.kalman.record_forecast`, with a record.
     """
 
     x_err: Tensor
@@ -160,6 +161,7 @@ class Terms(NamedTuple):
     non_finite: Tensor
     dtype: torch.dtype
     posterior: Posterior | None = None
+    skill: Tensor | None = None
 
 
 def diagnose(
@@ -170,7 +172,7 @@ def diagnose(
 ) -> L1Diagnostics:
     """The diagnostics of a step, with those of the switching law if given."""
     x_err, estimate, effect_matched, (q, unbounded, u) = terms[:4]
-    ill_conditioned, non_finite, dtype, posterior = terms[4:]
+    ill_conditioned, non_finite, dtype, posterior, skill = terms[4:]
     norms = torch.linalg.vector_norm(
         torch.stack([x_err, effect_matched, estimate - effect_matched], dim=-2), dim=-1
     )
@@ -191,6 +193,7 @@ def diagnose(
         ill_conditioned=ill_conditioned,
         non_finite=non_finite,
         **_significance(posterior, prediction_error),
+        forecast_skill=torch.ones_like(prediction_error) if skill is None else kalman.skill(skill),
     )
     return narrow_entries(diagnostics, dtype)
 

@@ -89,6 +89,8 @@ class L1Diagnostics(NamedTuple):
         posterior_deviation: norm of the standard deviations of the Kalman filter's estimate, action
             units; zero without that filter, like the next.
         significance: largest entry of its estimate in standard deviations.
+        forecast_skill: share of its estimate that is acted on, see
+            :func:`~torchrl_l1.control.kalman.skill`; one without a record of forecasts.
     """
 
     switch: Tensor
@@ -102,6 +104,7 @@ class L1Diagnostics(NamedTuple):
     non_finite: Tensor
     posterior_deviation: Tensor
     significance: Tensor
+    forecast_skill: Tensor
 
 
 def init(
