@@ -60,39 +60,47 @@ def expected(missed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, fl
     prior = PRIOR + PROCESS_NOISE**2 * np.eye(2)  # half the range of the action is one
     scale = np.sqrt(np.array([9.0, 1.0, 1.0]) * (9.0 + 1.0 + 1.0) / 3)
     weight = INFLATION * COVARIANCE * np.outer(scale, scale)
-    mean, _ = updated(MEAN, prior, SEEN, missed, weight)
-    left = missed - SEEN @ (mean - MEAN)
+    # What no disturbance explains that has just set in, of 0.3 of half the range.
+    sudden = prior + 0.3**2 * np.eye(2)
+    fit, spread = updated(MEAN, sudden, SEEN, missed, weight)
+    left = missed - SEEN @ (fit - MEAN)
     doubt = max(1.0, left @ np.linalg.inv(weight) @ left / 3)
+    square = left**2 + np.diag(SEEN @ spread @ SEEN.T) / ((9.0 + 1.0 + 1.0) / 3)
+    ratio = square / np.diag(INFLATION * COVARIANCE)
     mean, covariance = updated(MEAN, prior, SEEN, missed, doubt * weight)
-    left = missed - SEEN @ (mean - MEAN)
-    square = left**2 + np.diag(SEEN @ covariance @ SEEN.T)
-    return mean, covariance, square / np.diag(INFLATION * COVARIANCE), doubt
+    return mean, covariance, np.minimum(ratio, 25 * np.maximum(NOISE, 1)), doubt
 
 
-def forecast_before(missed: np.ndarray) -> tuple[float, float]:
-    """What the estimate before the step took off the square of the residual, and promised to."""
+def forecast_before(missed: np.ndarray, dead_zone: float) -> tuple[float, float]:
+    """What the estimate acted on took off the square of the residual, and promised to."""
     scale = np.sqrt(np.array([9.0, 1.0, 1.0]) * (9.0 + 1.0 + 1.0) / 3)
     doubt = expected(missed)[3]
     weight = np.linalg.inv(doubt * INFLATION * COVARIANCE * np.outer(scale, scale))
-    forecast, residual = SEEN @ MEAN, SEEN @ MEAN + missed
-    gained = residual @ weight @ residual - missed @ weight @ missed
-    return gained, forecast @ weight @ forecast
+    variance = np.diag(PRIOR) + PROCESS_NOISE**2
+    acted = MEAN * np.maximum(0, 1 - dead_zone**2 * variance / MEAN**2)
+    forecast, residual = SEEN @ acted, SEEN @ MEAN + missed
+    left = residual - forecast
+    return residual @ weight @ residual - left @ weight @ left, forecast @ weight @ forecast
 
 
 WRONG = -4 * SEEN @ MEAN  # the residual is thrice the forecast, with the other sign
 
 
+@pytest.mark.parametrize("dead_zone", [0.0, 0.35])  # the second leaves one of two entries alone
 @pytest.mark.parametrize("missed", [SMALL, WRONG, HUGE], ids=["small", "wrong", "huge"])
-def test_the_input_is_scaled_by_what_forecasts_have_gained_of_what_they_promised(missed):
-    config = L1Config.robust(0.05, skill_forgetting=0.9, dead_zone=0.0, **BOUNDS)
-    gained, promised = forecast_before(missed)
+def test_the_input_is_scaled_by_what_forecasts_have_gained_of_what_they_promised(missed, dead_zone):
+    config = L1Config.robust(0.05, skill_forgetting=0.9, dead_zone=dead_zone, **BOUNDS)
+    gained, promised = forecast_before(missed, dead_zone)
     found = estimate(config, *given(config, missed))
     sums = 0.9 * SKILL + [gained, promised]
     np.testing.assert_allclose(found.skill, sums)
     share = (sums[0] + 10) / (sums[1] + 10)
-    assert (share < 0) == (missed is WRONG)
+    assert (share < 0) == (missed is WRONG and dead_zone == 0)
+    mean, covariance, *_ = expected(missed)
+    mean = mean.clip(-2, 2)
+    significant = mean * np.maximum(0, 1 - dead_zone**2 * np.diag(covariance) / mean**2)
     acted = adapted(config, found, torch.zeros(2, dtype=torch.float64)).q
-    np.testing.assert_allclose(acted, min(max(share, 0.0), 1.0) * found.posterior.mean)
+    np.testing.assert_allclose(acted, min(max(share, 0.0), 1.0) * significant)
 
 
 @pytest.mark.parametrize(("period", "low", "high"), [(None, 0.99, 1.0), (4, 0.0, 0.2)])
@@ -123,6 +131,67 @@ def test_a_lasting_disturbance_is_acted_on_and_one_that_outruns_the_estimate_is_
         assert signals.forecast_skill.item() == pytest.approx(share)
     assert low <= found[0.99] / found[1.0] <= high
     assert found[1.0] > 0.2
+
+
+EFFECT = np.array([1.0, 0.5, 0.3])
+
+
+def inputs_against(
+    disturbance: np.ndarray, noise: float, glitch: float = 0.0, **settings: float
+) -> tuple[np.ndarray, L1State, np.ndarray]:
+    """Inputs ``[T, 50]`` against a disturbance ``[T]``, the last state, and shares acted on.
+
+    The model is right but for white noise. At step 30 the first sensor is off by ``glitch``.
+    """
+    config = L1Config.robust(0.05, process_noise=0.003, inflation=1.0, **settings, **BOUNDS)
+    statistics = ResidualStatistics(noise**2 * torch.eye(3, dtype=torch.float64))
+    state, rng = init([50], 3, 1, config, dtype=torch.float64), np.random.default_rng(0)
+    x, zero = torch.zeros(50, 3).double(), torch.zeros(50, 1).double()
+    jacobian = torch.as_tensor(EFFECT)[:, None].expand(50, 3, 1)
+    inputs, shares = [], []
+    for t, pushed in enumerate(disturbance):
+        seen = x.clone()
+        seen[:, 0] += glitch * (t == 30)
+        u, state, signals = step(config, state, seen, zero, -seen, jacobian, residuals=statistics)
+        force = (u + pushed).clamp(-1, 1)
+        x = force * torch.as_tensor(EFFECT) + noise * torch.as_tensor(rng.normal(size=(50, 3)))
+        inputs.append(u.squeeze(-1).numpy())
+        shares.append(signals.forecast_skill.squeeze(-1).numpy())
+    return np.stack(inputs), state, np.stack(shares)
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.01, 0.03, 0.1])
+@pytest.mark.parametrize(("before", "after"), [(0.0, 0.1), (0.0, 0.5), (0.4, -0.4), (-0.2, 0.0)])
+def test_a_change_after_long_quiet_is_followed_and_not_taken_for_noise(noise, before, after):
+    disturbance = np.concatenate([np.full(100, before), np.full(120, after)])
+    inputs, state, _ = inputs_against(disturbance, noise)
+    # One that is told how good its sensors are, and takes all else for the disturbance.
+    told, _, _ = inputs_against(disturbance, noise, forgetting=1.0, skill_forgetting=1.0)
+    error, least = (np.abs(one[160:] + after).mean() for one in (inputs, told))
+    assert error < 1.5 * least + 0.01
+    assert state.noise.median() < 1.1
+
+
+@pytest.mark.parametrize("size", [10.0, 100.0, 1000.0])
+def test_one_wild_value_of_a_sensor_does_not_blind_the_filter(size):
+    disturbance = np.concatenate([np.zeros(60), np.full(150, 0.2)])
+    calm, wild = (
+        np.median(inputs_against(disturbance, 0.1, glitch)[0], 1) < -0.16
+        for glitch in (0.0, 0.1 * size)
+    )
+    assert calm.any() and wild.any()
+    assert wild.argmax() < calm.argmax() + 10
+
+
+def test_what_a_disturbance_explains_is_not_noise_however_long_it_lasts():
+    disturbance = np.concatenate([np.zeros(60), np.full(1000, 0.05)])
+    *_, state, _ = inputs_against(disturbance, 0.01)
+    assert (state.noise.median(0).values < 1.1).all() and state.noise.max() < 3
+
+
+def test_with_nothing_to_forecast_its_skill_is_not_in_doubt():
+    inputs, _, shares = inputs_against(np.zeros(300), 0.1)
+    assert (inputs == 0).mean() > 0.98 and shares.mean(1).min() > 0.95
 
 
 @pytest.mark.parametrize("missed", [SMALL, HUGE], ids=["small", "huge"])

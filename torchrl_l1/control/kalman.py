@@ -175,7 +175,7 @@ def record_forecast(
 
     Args:
         sums: of the gains and of the promises before ``(..., 2)``.
-        forecast: whitened effect of the disturbance that was expected ``(..., n)``.
+        forecast: whitened effect of the disturbance that was acted on ``(..., n)``.
         innovation: whitened :math:`r - f` ``(..., n)``.
         forgetting: factor on the sums before.
 

@@ -33,6 +33,13 @@ value would ignore weak evidence; with a smaller one, noise at the bounds pulls 
 bias towards zero.
 """
 
+GLITCH = 25.0
+"""Largest ratio of a residual's square to its expected value that counts for the running mean.
+
+A single wild value of a sensor would otherwise blind the filter for hundreds of steps. A sensor
+that stays noisy is known within twenty.
+"""
+
 
 class Estimate(NamedTuple):
     """What the Kalman filter knows before it decides what to do.
@@ -137,6 +144,8 @@ def estimate(
     :math:`D_t` are running means of :func:`~.kalman.noise_ratio`, none below one, times their mean
     over the states: a state whose sensor has become noisy loses weight, and all states do if many
     have. A single residual beyond expectation loses weight at once, see :func:`~.kalman.doubt`.
+    Both ask what no disturbance explains that has just set in, as at a reset: a filter that has
+    long been sure would take any later change of the disturbance for noise.
 
     Args:
         config: the settings.
@@ -185,23 +194,35 @@ def estimate(
     others = unknown / scale
     columns, white = whitened(covariance + others @ others.mT, jacobian / scale, relative)
     white = white.squeeze(-1)
-    has_units = isinstance(config.half_range, tuple)
-    factor = kalman.factor(prior.covariance, half_range if has_units else None)
-    posterior = kalman.measurement_update(prior, columns, white, factor)
+    units = half_range if isinstance(config.half_range, tuple) else None
     if config.forgetting < 1:
+        # A disturbance may change at any step, and by more than the random walk expects: only what
+        # no change of it explains is noise. With no more states than actions a change explains
+        # everything, and the random walk has to tell.
+        sudden = initial if n > m else torch.zeros_like(initial)
+        unsure = Posterior(prior.mean, prior.covariance + sudden)
+        root = kalman.factor(unsure.covariance, units)
+        fit = kalman.measurement_update(unsure, columns, white, root)
         # A residual far beyond expectation loses that much weight at once.
-        doubt = kalman.doubt(columns, white, posterior.mean - prior.mean).sqrt()
+        doubt = kalman.doubt(columns, white, fit.mean - prior.mean).sqrt()
         columns, white = columns / doubt.unsqueeze(-1), white / doubt
-        posterior = kalman.measurement_update(prior, columns, white, factor)
-        left = residual - (jacobian @ posterior.mean.unsqueeze(-1)).squeeze(-1)
-        ratio = kalman.noise_ratio(covariance, jacobian, posterior, left, unknown)
+        left = residual - (jacobian @ fit.mean.unsqueeze(-1)).squeeze(-1)
+        # The common factor of the scale, taken for noise here, would feed on itself.
+        common = larger.mean(-1)[..., None, None]
+        fit = fit._replace(covariance=fit.covariance / common)
+        ratio = kalman.noise_ratio(covariance, jacobian, fit, left, unknown)
+        ratio = torch.minimum(ratio, GLITCH * larger)
         noise = torch.where(fresh, noise, torch.lerp(ratio, noise, config.forgetting))
+    root = kalman.factor(prior.covariance, units)
+    posterior = kalman.measurement_update(prior, columns, white, root)
 
     skill = past.skill
     if skill is not None:
-        forecast = (columns @ prior.mean.unsqueeze(-1)).squeeze(-1)
+        acted_on = kalman.significant(prior, config.dead_zone)
+        forecast = (columns @ acted_on.unsqueeze(-1)).squeeze(-1)
+        error = white + (columns @ (prior.mean - acted_on).unsqueeze(-1)).squeeze(-1)
         skill = skill.masked_fill(fresh, 0.0)
-        skill = kalman.record_forecast(skill, forecast, white, config.skill_forgetting)
+        skill = kalman.record_forecast(skill, forecast, error, config.skill_forgetting)
 
     flat = posterior.covariance.flatten(-2)
     entries = [observation, posterior.mean, flat, noise, *([] if skill is None else [skill])]
