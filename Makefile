@@ -54,7 +54,7 @@ docs: $(VENV)/.installed-docs ## Build the documentation, warnings are errors
 
 studies: $(VENV)/.installed-test ## Write the studies' tables and figures anew from committed data, check their pages
 	set -e; for script in $(STUDIES); do $(BIN)/python docs/results/$$script.py; done
-	$(BIN)/python -m pytest -q tests/test_studies.py
+	$(BIN)/python -m pytest -q tests/test_studies.py tests/test_study_numbers.py
 
 bench: $(VENV)/.installed-bench ## Run all speed tables (some minutes on an otherwise idle machine)
 	$(BIN)/python -m benchmarks $(BENCH_ARGS)

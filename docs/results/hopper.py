@@ -105,7 +105,11 @@ def draw(rows: Sequence[Row]) -> None:
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(axis="y", alpha=0.3)
     axes[0].set_ylabel("return of an episode")
-    figure.suptitle("Hopper: a frozen METRPO policy under a constant actuator bias (bound 1)")
+    figure.suptitle(
+        f"Hopper: one frozen METRPO policy (seed {rows[0]['seed']}) under a constant actuator bias "
+        f"(bound 1): {EPISODES} episodes, bar: median",
+        fontsize=10,
+    )
     figure.tight_layout()
     figure.savefig(HERE / "hopper.png", dpi=110)
 

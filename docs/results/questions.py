@@ -12,6 +12,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +23,7 @@ from matplotlib.axes import Axes
 from scipy.stats import binomtest
 
 from torchrl_l1.report.page import interval_text, markdown, number
-from torchrl_l1.report.published import published_cells
+from torchrl_l1.report.published import PublishedCell, published_cells
 from torchrl_l1.report.style import color as color_of
 
 HERE = Path(__file__).with_name("questions")
@@ -35,6 +36,8 @@ SCALES = {
     "walker": 800.0,
     "half_cheetah": 3270.0,
 }
+# Whose returns are compared.
+ACTIONS = {"stochastic": "sampled", "deterministic": "mean"}
 ENDS = ("difference_low", "difference_high")
 Row = dict[str, str]
 
@@ -102,14 +105,7 @@ def ours(table: Table, task: str, noise: str, l1: str) -> Found | None:
             for row in rows(edition, "training.csv")
             if (row["task"], row["noise"]) == (task, noise) and not row["variant"]
         }
-        pair = [
-            row
-            for row in rows(edition, "pairs.csv")
-            if (row["task"], row["noise"], row["l1"]) == (task, noise, l1)
-            and row["policy"] == "stochastic"
-            and not row["variant"]
-            and int(row["pairs"])
-        ]
+        pair = paired(edition, (task, noise, l1), "stochastic")
         for arm in ("off", l1) if pair else ():
             returns[arm] = str(mean_return(edition, (task, noise, arm), pair[0]["seeds"].split()))
         on = returns.get(l1, "")
@@ -117,6 +113,18 @@ def ours(table: Table, task: str, noise: str, l1: str) -> Found | None:
         if found.off and (best is None or found.pairs >= best.pairs):
             best = found
     return best
+
+
+def paired(edition: str, cell: tuple[str, str, str], policy: str) -> list[Row]:
+    """Rows of an edition's paired differences in a cell: one, or none."""
+    return [
+        row
+        for row in rows(edition, "pairs.csv")
+        if (row["task"], row["noise"], row["l1"]) == cell
+        and row["policy"] == policy
+        and not row["variant"]
+        and int(row["pairs"])
+    ]
 
 
 def mean_return(edition: str, cell: tuple[str, str, str], seeds: Sequence[str]) -> float:
@@ -157,13 +165,21 @@ def line(table: Table, task: str, noise: str, l1: str, found: Found | None) -> R
             if found.pair.get("difference_low"):
                 ends = {name: float(found.pair[name]) for name in ENDS}
                 words["95 % interval"] = interval_text(ends, "difference")
-    off, on = (published_cells()[table.number, task, noise, arm, arm] for arm in ("off", "on"))
     words |= dict.fromkeys(("published off", "published on", "its difference"), "")
     if l1 == "paper":
-        words |= {"published off": off.mean, "published on": on.mean}
+        off, on = published(table, task, noise)
+        words |= {
+            f"published {arm}": f"{of.mean} ± {of.std}" for arm, of in (("off", off), ("on", on))
+        }
         words["its difference"] = f"{float(on.mean) - float(off.mean):.4g}"
     words["runs of"] = found.edition if found else ""
     return words
+
+
+def published(table: Table, task: str, noise: str) -> tuple[PublishedCell, PublishedCell]:
+    """What the paper prints in a cell, without L1 and with it."""
+    off, on = (published_cells()[table.number, task, noise, arm, arm] for arm in ("off", "on"))
+    return off, on
 
 
 def cells_of(table: Table) -> None:
@@ -174,11 +190,13 @@ def cells_of(table: Table) -> None:
     cells = [(task, noise) for task in SCALES for noise in NOISES]
     for place, (task, noise) in enumerate(cells):
         run, scale = False, SCALES[task]
+        off, on = published(table, task, noise)
+        theirs = (float(on.mean) - float(off.mean)) / scale
+        spread = np.hypot(float(off.std), float(on.std)) / scale
+        ax.errorbar(theirs, place, xerr=spread, fmt="o", color="0.6", elinewidth=1, zorder=1)
         for l1, offset in table.arms.items():
             found = ours(table, task, noise, l1)
             lines.append(line(table, task, noise, l1, found))
-            if theirs := lines[-1]["its difference"]:
-                ax.plot(float(theirs) / scale, place, "o", color="0.6")
             if found is not None and found.pair is not None:
                 draw(ax, found.pair, place + offset, scale, color_of(0, l1))
                 run = True
@@ -187,9 +205,9 @@ def cells_of(table: Table) -> None:
     ax.invert_yaxis()
     ax.set_yticks(range(len(cells)), labels)
     ax.set_xlabel("return with L1 in training less that without, as a share of the task's scale")
-    ax.plot([], [], "o", color="0.6", label="published")
+    ax.plot([], [], "o", color="0.6", label="published, ± its spreads over seeds")
     for l1 in table.arms:
-        label = f"ours, {l1}: mean, interval, seeds"
+        label = f"ours, {l1}: mean, 95 % interval, seeds"
         ax.plot([], [], "D-", color=color_of(0, l1), markersize=4, label=label)
     single = {"color": "0.3", "markersize": 4, "markerfacecolor": "white"}
     ax.plot([], [], "D", **single, label="hollow: a single seed")
@@ -200,41 +218,51 @@ def cells_of(table: Table) -> None:
 
 
 def ahead() -> None:
-    """In how many pairs of seeds the return is higher with L1 in training, by task and noise.
+    """In how many pairs of seeds and cells the return is higher with L1 in training.
 
-    Pairs without any difference count for neither.
+    Pairs without any difference count for neither. Those of a cell are not independent, so the
+    interval is that of the share of cells, by their mean difference.
     """
-    groups = ["all", *(task.replace("_", " ") for task in SCALES), *map("noise {}".format, NOISES)]
+    groups = [*(task.replace("_", " ") for task in SCALES), *map("noise {}".format, NOISES)]
+    arms = [(METRPO, "paper"), (METRPO, "robust"), (MBMF, "paper")]
     lines = []
-    for table, l1 in [(METRPO, "paper"), (METRPO, "robust"), (MBMF, "paper")]:
-        signs: dict[str, list[bool]] = {}
-        for task in SCALES:
-            for noise in NOISES:
-                found = ours(table, task, noise, l1)
-                if found is None or found.pair is None:
-                    continue
-                differences = map(float, found.pair["differences"].split())
-                higher = [difference > 0 for difference in differences if difference]
-                for group in ("all", task.replace("_", " "), f"noise {noise}"):
-                    signs.setdefault(group, []).extend(higher)
-        every = signs["all"]
-        ends = binomtest(sum(every), len(every)).proportion_ci()
-        share = f"{np.mean(every):.2f} [{ends.low:.2f}, {ends.high:.2f}]"
-        counted = {
-            group: f"{sum(signs[group])} of {len(signs[group])}" if signs.get(group) else ""
-            for group in groups
-        }
-        arm = {"algorithm": table.algorithm, "L1 in training": l1}
-        lines.append({**arm, "share": share, **counted})
+    for (table, l1), (policy, action) in product(arms, ACTIONS.items()):
+        pairs: list[bool] = []
+        cells: list[bool] = []
+        signs: dict[str, list[bool]] = {group: [] for group in groups}
+        for task, noise in product(SCALES, NOISES):
+            found = ours(table, task, noise, l1)
+            if found is None or found.pair is None:
+                continue
+            [pair] = paired(found.edition, (task, noise, l1), policy)
+            differences = map(float, pair["differences"].split())
+            higher = [difference > 0 for difference in differences if difference]
+            cells.append(float(pair["difference_mean"]) > 0)
+            for group in (pairs, signs[task.replace("_", " ")], signs[f"noise {noise}"]):
+                group.extend(higher)
+        ends = binomtest(sum(cells), len(cells)).proportion_ci()
+        lines.append(
+            {"algorithm": table.algorithm, "L1 in training": l1, "action": action}
+            | {"pairs": count(pairs), "share": f"{np.mean(pairs):.2f}", "cells": count(cells)}
+            | {"share of cells": f"{np.mean(cells):.2f} [{ends.low:.2f}, {ends.high:.2f}]"}
+            | {group: count(of) for group, of in signs.items()}
+        )
     (HERE / "ahead.md").write_text(markdown(lines) + "\n")
+
+
+def count(signs: Sequence[bool]) -> str:
+    """How many of them hold; empty if there are none."""
+    return f"{sum(signs)} of {len(signs)}" if signs else ""
 
 
 def recovered() -> None:
     """What the controllers recover of the oracle's gain, by task."""
     HERE.mkdir(exist_ok=True)
-    lines = {}
+    lines, policies = {}, {}
     for task in robust.TASKS:
-        found = robust.overall(robust.read(robust.HERE / f"{task}.csv"))
+        episodes = robust.read(robust.HERE / f"{task}.csv")
+        found = robust.overall(episodes)
+        policies[task] = len({row["run"] for row in episodes})
         lines[task] = {l1: found[f"{l1} recovered"] for l1 in ("paper", "robust")}
     table = [
         {"share of the oracle's gain": words}
@@ -253,7 +281,11 @@ def recovered() -> None:
             ax.plot([place, place], [low, high], color="0.2", lw=1.2)
     ax.axhline(0, color="0.5", lw=0.8)
     ax.axhline(1, color="0.5", lw=0.8, ls="--")
-    ax.set_xticks(range(len(lines)), [task.replace("_", " ") for task in lines])
+    ax.set_xticks(
+        range(len(lines)),
+        [f"{task.replace('_', ' ')}\n{many} policies" for task, many in policies.items()],
+    )
+    ax.set_title("lines: 95 % bootstrap, too narrow with so few policies", fontsize=9)
     ax.set_ylabel("share of the oracle's gain")
     ax.legend(loc="lower left")
     figure.savefig(HERE / "recovered.png", dpi=110)

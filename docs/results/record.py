@@ -24,7 +24,7 @@ from torchrl_l1.control import kalman
 from torchrl_l1.experiment.evaluate import load_run, make_collection
 from torchrl_l1.experiment.files import write_table
 from torchrl_l1.experiment.matrix import Condition
-from torchrl_l1.report.page import markdown
+from torchrl_l1.report.page import markdown, number
 from torchrl_l1.report.statistics import mean_interval
 
 HERE = Path(__file__).parent
@@ -60,8 +60,18 @@ def measure(run: Path) -> list[Row]:
     return rows
 
 
+def difference(values: np.ndarray) -> str:
+    """Mean over the resets, with its interval."""
+    interval = mean_interval(list(values))
+    assert interval is not None
+    return f"{number(values.mean())} [{number(interval.low)}, {number(interval.high)}]"
+
+
 def table(rows: list[Row]) -> str:
-    """Mean returns, and what the record changes of them, with its 95 % interval by Student's t."""
+    """Mean returns, what the record changes of them, and what the controller with it changes.
+
+    The 95 % intervals are by Student's t.
+    """
     of = {
         (row["policy"], row["disturbance"], row["l1"]): np.array(row["returns"].split(), np.float64)
         for row in rows
@@ -70,9 +80,6 @@ def table(rows: list[Row]) -> str:
     for policy in dict.fromkeys(row["policy"] for row in rows):
         for words in CELLS:
             returns = {arm: of[policy, words, arm] for arm in ARMS}
-            change = returns["robust"] - returns["whole"]
-            interval = mean_interval(list(change))
-            assert interval is not None
             lines.append(
                 {
                     "policy": policy.replace("_", " "),
@@ -80,7 +87,8 @@ def table(rows: list[Row]) -> str:
                     "without L1": f"{returns['off'].mean():.4g}",
                     "without the record": f"{returns['whole'].mean():.4g}",
                     "with it": f"{returns['robust'].mean():.4g}",
-                    "change": f"{change.mean():.3g} [{interval.low:.3g}, {interval.high:.3g}]",
+                    "change": difference(returns["robust"] - returns["whole"]),
+                    "with it less without L1": difference(returns["robust"] - returns["off"]),
                 }
             )
     return markdown(lines)
