@@ -25,7 +25,7 @@ from torchrl_l1.experiment.evaluate import load_run, make_collection
 from torchrl_l1.experiment.files import write_table
 from torchrl_l1.experiment.matrix import Condition
 from torchrl_l1.report.page import markdown
-from torchrl_l1.report.statistics import mean_interval
+from torchrl_l1.report.statistics import student_interval
 
 HERE = Path(__file__).parent
 EPISODES, SEED = 8, 0
@@ -60,8 +60,14 @@ def measure(run: Path) -> list[Row]:
     return rows
 
 
+def less(one: np.ndarray, other: np.ndarray) -> str:
+    """Mean difference of paired episodes, with its interval."""
+    difference = one - other
+    return f"{difference.mean():.3g} {student_interval(difference.tolist()):.3g}"
+
+
 def table(rows: list[Row]) -> str:
-    """Mean returns, and what the record changes of them, with its 95 % interval by Student's t."""
+    """Mean returns, and their differences, with 95 % intervals by Student's t over episodes."""
     of = {
         (row["policy"], row["disturbance"], row["l1"]): np.array(row["returns"].split(), np.float64)
         for row in rows
@@ -70,9 +76,6 @@ def table(rows: list[Row]) -> str:
     for policy in dict.fromkeys(row["policy"] for row in rows):
         for words in CELLS:
             returns = {arm: of[policy, words, arm] for arm in ARMS}
-            change = returns["robust"] - returns["whole"]
-            interval = mean_interval(list(change))
-            assert interval is not None
             lines.append(
                 {
                     "policy": policy.replace("_", " "),
@@ -80,7 +83,8 @@ def table(rows: list[Row]) -> str:
                     "without L1": f"{returns['off'].mean():.4g}",
                     "without the record": f"{returns['whole'].mean():.4g}",
                     "with it": f"{returns['robust'].mean():.4g}",
-                    "change": f"{change.mean():.3g} [{interval.low:.3g}, {interval.high:.3g}]",
+                    "change": less(returns["robust"], returns["whole"]),
+                    "with it less without L1": less(returns["robust"], returns["off"]),
                 }
             )
     return markdown(lines)
