@@ -99,7 +99,8 @@ def mean_interval(values: Sequence[float]) -> Interval | None:
     on, the bias-corrected and accelerated bootstrap, or the percentile one where that is undefined.
     Of normal values, Student's t contains the mean in 95 of 100 samples of any size, this
     bootstrap in 84, 89, 92 and 94 of 100 for 5, 10, 20 and 30 values; of log-normal ones, t in 83,
-    84, 87 and 88, the bootstrap in 75, 84, 87 and 89. The resampling has a fixed seed: the same values give the same interval.
+    84, 87 and 88, the bootstrap in 75, 84, 87 and 89. The resampling has a fixed seed: the same
+    values give the same interval.
 
     Args:
         values: one value per seed.
