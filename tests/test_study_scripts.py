@@ -133,7 +133,7 @@ def biased(returns: dict[str, dict[str, float]]) -> list[dict[str, Any]]:
         {"run": run, "l1": l1, "noise": "none", "bias": bias, "signs": 0.0, "return": value}
         for run, of in returns.items()
         for l1, under_bias in of.items()
-        for bias, value in ((0.0, 100.0), (0.2, under_bias - 1), (0.2, under_bias + 1))
+        for bias, value in ((0.0, 100.0), *((0.2, under_bias + one) for one in (-1, 0, 1)))
     ]
 
 
@@ -157,6 +157,7 @@ def test_shares_of_few_policies_are_told_only_where_they_agree(
     assert (line["costly disturbances"], line["robust recovered"]) == ("0 of 1", robust.UNTOLD)
     alone = robust.overall("task", biased({"seed_0": returns["seed_1"]}))
     assert alone["all: robust less off"] == "6 (one policy)"
+    assert alone["robust recovered"].endswith("] over its episodes")
 
 
 def test_policies_that_have_learned_nothing_are_marked(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -280,7 +280,7 @@ def recovered() -> None:
                 ax.text(place, 0.05, "not\ntold", ha="center", fontsize=7, color="0.4")
                 continue
             mean, ends = of[l1].split(" ", 1)
-            low, high = (float(end) for end in ends.strip("[]").split(", "))
+            low, high = (float(end) for end in ends.strip("[").partition("]")[0].split(", "))
             ax.bar(place, float(mean), 0.34, color=color_of(0, l1), alpha=0.75, label=label)
             ax.plot([place, place], [low, high], color="0.2", lw=1.2)
     ax.axhline(0, color="0.5", lw=0.8)

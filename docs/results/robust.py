@@ -167,11 +167,12 @@ def overall(task: str, episodes: Sequence[Row]) -> dict[str, str]:
     for l1 in ("paper", "robust"):
         kinds = {"recovered": runs, "recovered, not tuned on": held_out}
         for words, chosen_runs in kinds.items():
-            line[f"{l1} {words}"] = UNTOLD
+            line[f"{l1} {words}"] = UNTOLD if chosen_runs else "–"
             if costly and chosen_runs:
                 found = shares(l1, costly, chosen_runs)
                 if found.share is not None and found.interval is not None:
-                    line[f"{l1} {words}"] = f"{found.share:.2f} {found.interval:.2f}"
+                    text = f"{found.share:.2f} {found.interval:.2f}"
+                    line[f"{l1} {words}"] = text + " over its episodes" * (found.policies == 1)
         single = []
         for run in runs if costly else ():
             off, on, oracle = (
