@@ -55,6 +55,52 @@ def test_the_sample_of_the_suite_is_its_resets(monkeypatch: pytest.MonkeyPatch) 
         assert ttest_1samp(on - off - end * loss, 0.0).pvalue == pytest.approx(0.05)
 
 
+def test_the_sample_of_the_suite_is_its_policies_if_there_are_three(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    suite = script("suite", monkeypatch)
+    rng = np.random.default_rng(1)
+    cell = ("bias", 1.0)
+    # Policies gain more or less, each the same from all resets.
+    gains = np.array([1.0, 2.0, 6.0])
+    returns = {}
+    for policy, gain in enumerate(gains):
+        off = rng.normal(10.0, 1.0, 8)
+        returns[f"seed_{policy}", "off", suite.NONE] = np.full(8, 20.0)
+        returns |= {(f"seed_{policy}", "off", cell): off}
+        returns |= {(f"seed_{policy}", "robust", cell): off + gain}
+    _, interval = suite.change(returns, "robust", [cell])
+    expected = ttest_1samp(gains / 20, 0.0).confidence_interval()
+    assert (interval.low, interval.high) == pytest.approx((expected.low, expected.high))
+    share, _ = suite.regained(returns, "robust", [cell])
+    assert share == pytest.approx(gains.mean() / suite.lost(returns, [cell]).mean())
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ([0.0, 0.1, -0.1, 0.0], "not touched"),
+        ([0.7, -0.6, 0.2, -0.3], "not touched"),
+        ([1.2, -0.8, 0.3, -0.4], "cannot tell"),
+        ([-5.0, 4.0, 0.0, 1.0], "cannot tell"),
+        ([-1.0, -1.1, -0.9, -1.0], "worse"),
+        ([1.0, 1.1, 0.9, 1.0], "helped"),
+    ],
+)
+def test_a_disturbance_is_not_touched_only_if_any_large_change_is_excluded(
+    changes: list[float], word: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite = script("suite", monkeypatch)
+    cell = ("bias", 1.0)
+    returns = {("seed_0", "off", one): np.full(4, 10.0) for one in (suite.NONE, cell)}
+    returns["seed_0", "robust", cell] = 10.0 + np.array(changes)
+    # Of an undisturbed return of 10, 10 % is 1.
+    if word not in ("worse", "helped"):
+        low, high = ttest_1samp(changes, 0.0).confidence_interval()
+        assert (word == "not touched") == (low >= -1 and high <= 1)
+    assert suite.verdict(returns, "robust", [cell]) == word
+
+
 def test_figure_of_the_suite_says_what_lies_beyond_its_colours(
     drawn: list[Figure], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -63,6 +109,10 @@ def test_figure_of_the_suite_says_what_lies_beyond_its_colours(
     images = [axis.images[0] for axis in drawn[0].axes[:2]]
     assert min(image.get_array().min() for image in images) < images[-1].norm.vmin
     assert images[-1].colorbar.extend == "both"
+    hatched = sum(bool(patch.get_hatch()) for axis in drawn[0].axes[:2] for patch in axis.patches)
+    unknown = [row["walker (1)"] for row in rows((RESULTS / "suite/verdicts.md").read_text())][-1]
+    assert hatched == sum(map(int, unknown.split(" / ")))
+    assert [text.get_text() for text in drawn[0].legends[0].get_texts()] == ["cannot tell"]
 
 
 def test_no_model_lies_outside_the_figure(
@@ -77,6 +127,54 @@ def test_no_model_lies_outside_the_figure(
             assert low < min(line.get_xdata()) and max(line.get_xdata()) < high
 
 
+def biased(returns: dict[str, dict[str, float]]) -> list[dict[str, Any]]:
+    """Episodes without a disturbance, all of 100, and of a bias, by controller and policy."""
+    return [
+        {"run": run, "l1": l1, "noise": "none", "bias": bias, "signs": 0.0, "return": value}
+        for run, of in returns.items()
+        for l1, under_bias in of.items()
+        for bias, value in ((0.0, 100.0), *((0.2, under_bias + one) for one in (-1, 0, 1)))
+    ]
+
+
+def test_shares_of_few_policies_are_told_only_where_they_agree(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    robust = script("robust", monkeypatch)
+    gaps = np.array([10.0, 12.0, 11.0])
+    returns = {
+        f"seed_{seed}": {"off": 50.0, "paper": 50.0, "robust": 50 + 0.5 * gap, "oracle": 50 + gap}
+        for seed, gap in enumerate(gaps)
+    }
+    line = robust.overall("task", biased(returns))
+    assert line["robust recovered"] == "0.50 [0.50, 0.50]"
+    assert line["robust, by policy"] == "0.50, 0.50, 0.50"
+    low, high = ttest_1samp(gaps / 2, 0.0).confidence_interval()
+    assert line["all: robust less off"] == f"{gaps.mean() / 2:.3g} [{low:.3g}, {high:.3g}]"
+    # The oracle's gain, 0.3, 10 and 20, is not told from 0 by three policies.
+    returns["seed_0"]["oracle"], returns["seed_2"]["oracle"] = 50.3, 70.0
+    line = robust.overall("task", biased(returns))
+    assert (line["costly disturbances"], line["robust recovered"]) == ("0 of 1", robust.UNTOLD)
+    alone = robust.overall("task", biased({"seed_0": returns["seed_1"]}))
+    assert alone["all: robust less off"] == "6 (one policy)"
+    assert alone["robust recovered"].endswith("] over its episodes")
+
+
+def test_policies_that_have_learned_nothing_are_marked(monkeypatch: pytest.MonkeyPatch) -> None:
+    robust = script("robust", monkeypatch)
+
+    def idle(task: str, *returns: float) -> set[str]:
+        rows = [
+            {"run": f"seed_{seed}", "l1": "off", "noise": "none", "bias": 0.0, "signs": 0.0}
+            | {"return": value}
+            for seed, value in enumerate(returns)
+        ]
+        return robust.idle(task, rows)
+
+    assert idle("hopper", 900.0, -328.0, 89.0, 91.0) == {"seed_1", "seed_2"}
+    assert idle("inverted_pendulum", -0.001, -9.0, -95.0) == {"seed_2"}
+
+
 def test_returns_of_either_sign_do_not_shrink_what_harm_is_measured_by(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -88,7 +186,8 @@ def test_returns_of_either_sign_do_not_shrink_what_harm_is_measured_by(
         for l1, value in of.items()
     ]
     # -20 and 0, of 100 and 60.
-    assert robust.harm(episodes, "none", "paper", draws=2)["mean"] == "-12.5"
+    low, high = ttest_1samp([-25.0, 0.0], 0.0).confidence_interval()
+    assert robust.harm(episodes, "none", "paper") == f"-12.5 [{low:+.1f}, {high:+.1f}]"
 
 
 def write(file: Path, rows: Sequence[dict[str, Any]]) -> None:
@@ -158,6 +257,32 @@ def test_qualities_that_a_campaign_lacks_are_kept(
     assert [row for row in after if not offline.select([row], **of_run)] == others
 
 
+@pytest.mark.parametrize("seeds", [2, 3])
+def test_offline_learning_has_intervals_and_shares_from_three_seeds_on(
+    seeds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    offline = script("offline", monkeypatch)
+    gains = {"off": 0.0, "paper": 1.0, "robust": 2.0, "oracle": 4.0}
+    episodes = [
+        {"task": "hopper", "quality": "expert", "seed": seed, "l1": l1, "bias": bias}
+        | {"return": 10.0 * seed + gain * bool(bias) + episode}
+        for seed in range(seeds)
+        for l1, gain in gains.items()
+        for bias in (0.0, 0.2)
+        for episode in range(2)
+    ]
+    summary = offline.summarize(episodes)
+    (row,) = offline.select(summary, bias="biased", l1="robust")
+    line = rows(offline.recovered_page(summary))[-1]
+    if seeds == 2:
+        assert (row["return_low"], row["share"]) == ("", "")
+        assert line["robust"] == "2, 2" and "robust recovers" not in line
+    else:
+        low, high = ttest_1samp([2.5, 12.5, 22.5], 0.0).confidence_interval()
+        assert (row["return_low"], row["return_high"]) == pytest.approx((low, high))
+        assert line["robust recovers"] == "0.50 [0.50, 0.50]"
+
+
 CONFIG = L1Config.robust(0.02, action_low=-1.0, action_high=1.0)
 
 
@@ -180,6 +305,20 @@ def test_what_the_record_of_forecasts_changes_on_other_policies_is_counted() -> 
     cells = rows((RESULTS / "record.md").read_text())
     changes = [re.findall(r"-?[\d.]+(?:e\+\d+)?", cell["change"]) for cell in cells]
     assert all(float(high) > 0 for _, _, high in changes)  # none is worse
+    with (RESULTS / "record.csv").open(newline="") as handle:
+        arms = {
+            row["l1"]: np.array(row["returns"].split(), np.float64)
+            for row in csv.DictReader(handle)
+            if (row["policy"], row["disturbance"]) == ("half_cheetah seed 2", "dead zone 0.2")
+        }
+    test = ttest_1samp(arms["robust"] - arms["off"], 0.0).confidence_interval()
+    (cell,) = (
+        cell["with it less without L1"]
+        for cell in cells
+        if (cell["policy"], cell["disturbance"]) == ("half cheetah seed 2", "dead zone 0.2")
+    )
+    mean = (arms["robust"] - arms["off"]).mean()
+    assert cell == f"{mean:.3g} [{test.low:.3g}, {test.high:.3g}]"
     late = [
         change for cell, change in zip(cells, changes, strict=True) if "late" in cell["disturbance"]
     ]

@@ -6,7 +6,8 @@
 
 Writes `cells.csv` (returns of the episodes of each run, controller and bias), `summary.csv`,
 `returns.md`, `recovered.md`, `imagination.md` and `returns.png` to the folder `offline` beside this
-file; without a campaign's runs, all but the first again from it.
+file; without a campaign's runs, all but the first again from it. Below three learning seeds there
+are the values of each and no intervals or shares; from three on, intervals over seeds.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ import numpy as np
 from torchrl_l1.envs import get_task
 from torchrl_l1.experiment.files import write_table
 from torchrl_l1.experiment.run_directory import read_config
-from torchrl_l1.report.page import markdown, number
+from torchrl_l1.report.page import interval_text, markdown, number
+from torchrl_l1.report.statistics import MIN_SAMPLES, mean_interval, recovered
 from torchrl_l1.report.style import color, title
 
 HERE = Path(__file__).parent / "offline"
 TASKS = ("inverted_pendulum", "half_cheetah", "hopper")
 QUALITIES = ("random", "medium", "expert")
 CONTROLLERS = {l1: color(0, l1) for l1 in ("off", "paper", "robust", "oracle")}
-RESAMPLES = 2000
 Row = dict[str, Any]
 
 
@@ -115,20 +116,6 @@ def table(rows: Sequence[Row], l1: str, biases: Sequence[float]) -> np.ndarray:
     )
 
 
-def resampled(shape: tuple[int, ...], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of seeds, and of episodes in each, drawn with replacement."""
-    seeds = rng.integers(shape[0], size=(RESAMPLES, shape[0]))
-    episodes = rng.integers(shape[2], size=(RESAMPLES, shape[0], shape[2]))
-    return seeds, episodes
-
-
-def means(values: np.ndarray, seeds: np.ndarray, episodes: np.ndarray) -> np.ndarray:
-    """Mean over all of each resample ``(RESAMPLES,)``; equal draws for all controllers."""
-    drawn = values[seeds[:, :, None, None], np.arange(values.shape[1])[:, None],
-                   episodes[:, :, None, :]]  # fmt: skip
-    return drawn.mean((1, 2, 3))
-
-
 def summarize(rows: Sequence[Row]) -> list[Row]:
     """A row for each task, quality, bias (all but 0 together too) and controller."""
     found = []
@@ -142,38 +129,42 @@ def summarize(rows: Sequence[Row]) -> list[Row]:
             groups["biased"] = [bias for bias in every if bias]
             for name, biases in groups.items():
                 tables = {l1: table(cell, l1, biases) for l1 in CONTROLLERS}
-                draws = resampled(tables["off"].shape, np.random.default_rng(0))
-                samples = {l1: means(values, *draws) for l1, values in tables.items()}
+                off, oracle = tables["off"], tables["oracle"]
                 for l1, values in tables.items():
-                    low, high = np.percentile(samples[l1], (2.5, 97.5))
-                    change = samples[l1] - samples["off"]
-                    found.append(
-                        {
-                            "task": task,
-                            "quality": quality,
-                            "bias": name,
-                            "l1": l1,
-                            "seeds": values.shape[0],
-                            "episodes_per_seed": values.shape[2],
-                            "return_mean": float(values.mean()),
-                            "return_low": float(low),
-                            "return_high": float(high),
-                            "change": float(values.mean() - tables["off"].mean()),
-                            "change_low": float(np.percentile(change, 2.5)),
-                            "change_high": float(np.percentile(change, 97.5)),
-                        }
-                    )
+                    row = {"task": task, "quality": quality, "bias": name, "l1": l1}
+                    row |= {"seeds": values.shape[0], "episodes_per_seed": values.shape[2]}
+                    row |= over_seeds("return", values) | over_seeds("change", values - off)
+                    row["share"] = ""
+                    if len(values) >= MIN_SAMPLES and name == "biased":
+                        of = ([one.ravel() for one in arm] for arm in (off, values, oracle))
+                        share = recovered(*of)
+                        if share.share is not None and share.gap > 0:
+                            row["share"] = f"{share.share:.2f} {share.interval:.2f}"
+                    found.append(row)
     return found
 
 
-def interval(row: Row, name: str) -> str:
-    """A mean with its interval."""
-    low, high = number(row[f"{name}_low"]), number(row[f"{name}_high"])
-    return f"{number(row['return_mean' if name == 'return' else name])} [{low}, {high}]"
+def over_seeds(name: str, values: np.ndarray) -> Row:
+    """Mean, and its interval if there are three or more seeds; and the value of each seed."""
+    single = values.mean((1, 2))
+    interval = mean_interval(single.tolist())
+    return {
+        f"{name}_mean": float(single.mean()),
+        f"{name}_low": interval.low if interval else "",
+        f"{name}_high": interval.high if interval else "",
+        f"{name}_by_seed": " ".join(f"{one:.5g}" for one in single),
+    }
+
+
+def cell_text(row: Row, name: str) -> str:
+    """A mean with its interval, or of few seeds the values."""
+    if row[f"{name}_low"] == "":
+        return ", ".join(number(float(one)) for one in row[f"{name}_by_seed"].split())
+    return f"{number(row[f'{name}_mean'])} {interval_text(row, name)}"
 
 
 def returns_page(summary: Sequence[Row], rows: Sequence[Row], horizon: dict[str, int]) -> str:
-    """Means by controller, without bias and with."""
+    """Returns by controller, without bias and with."""
     lines = []
     for task in TASKS:
         for quality in QUALITIES:
@@ -189,7 +180,7 @@ def returns_page(summary: Sequence[Row], rows: Sequence[Row], horizon: dict[str,
                     "return of the data": number(data),
                     "bias": "none" if bias == "0" else "all others",
                 }
-                lines.append(line | {l1: interval(of_bias[l1], "return") for l1 in CONTROLLERS})
+                lines.append(line | {l1: cell_text(of_bias[l1], "return") for l1 in CONTROLLERS})
     return markdown(lines)
 
 
@@ -199,21 +190,12 @@ def recovered_page(summary: Sequence[Row]) -> str:
     for row in summary:
         if row["l1"] == "off" or row["bias"] not in ("0", "biased"):
             continue
-        where = {key: row[key] for key in ("task", "quality", "bias")}
-        place = {
-            "task": row["task"],
-            "data": row["quality"],
-            "bias": "none" if row["bias"] == "0" else "all others",
-        }
         if row["l1"] == "paper":
-            lines.append(place)
-        lines[-1][row["l1"]] = interval(row, "change")
-        if row["l1"] == "oracle":
-            robust = select(summary, l1="robust", **where)[0]["change"]
-            paper = select(summary, l1="paper", **where)[0]["change"]
-            clear = row["change_low"] > 0 and row["bias"] == "biased"
-            for name, value in (("paper", paper), ("robust", robust)):
-                lines[-1][f"{name} recovers"] = f"{value / row['change']:.2f}" if clear else ""
+            bias = "none" if row["bias"] == "0" else "all others"
+            lines.append({"task": row["task"], "data": row["quality"], "bias": bias})
+        lines[-1][row["l1"]] = cell_text(row, "change")
+        if row["l1"] != "oracle":
+            lines[-1][f"{row['l1']} recovers"] = row["share"]
     return markdown(lines)
 
 
@@ -241,7 +223,10 @@ def imagination_page(rows: Sequence[Row], horizon: dict[str, int]) -> str:
 
 
 def draw(summary: Sequence[Row]) -> None:
-    """Returns against the bias, a panel for each task and quality."""
+    """Returns against the bias, a panel for each task and quality.
+
+    Lines are means over seeds, with their intervals or, of few seeds, a dash for each.
+    """
     tasks = [task for task in TASKS if select(summary, task=task)]
     figure, axes = plt.subplots(
         len(tasks), len(QUALITIES), figsize=(9.5, 2.7 * len(tasks)), squeeze=False
@@ -260,9 +245,16 @@ def draw(summary: Sequence[Row]) -> None:
                 )
                 style = "--" if l1 == "oracle" else "-"
                 axis.plot(biases, mean, style, marker="o", ms=3, color=colour, label=l1)
-                axis.fill_between(biases, low, high, color=colour, alpha=0.12, linewidth=0)
-            axis.set_title(f"{title(task)}, {quality} data", fontsize=9)
-            if not select(summary, task=task, quality=quality):
+                if "" not in low:
+                    axis.fill_between(biases, low, high, color=colour, alpha=0.12, linewidth=0)
+                    continue
+                for bias, row in zip(biases, cell, strict=True):
+                    single = list(map(float, row["return_by_seed"].split()))
+                    axis.plot([bias] * len(single), single, "_", color=colour, alpha=0.6)
+            tested = select(summary, task=task, quality=quality)
+            seeds = f", n = {tested[0]['seeds']}" if tested else ""
+            axis.set_title(f"{title(task)}, {quality} data{seeds}", fontsize=9)
+            if not tested:
                 axis.text(0.5, 0.5, "not run", ha="center", transform=axis.transAxes)
                 axis.set_axis_off()
                 continue

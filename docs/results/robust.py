@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import csv
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +25,27 @@ from torchrl_l1.experiment.matrix import disturbance_words
 from torchrl_l1.report.evaluation_summary import summarize, summary_lines
 from torchrl_l1.report.page import markdown
 from torchrl_l1.report.recovery import MEDIANS, plot_heat_map
-from torchrl_l1.report.statistics import recovered
+from torchrl_l1.report.statistics import Recovery, recovered, student_interval
 
 HERE = Path(__file__).with_name("robust")
 TASKS = ("inverted_pendulum", "swimmer", "hopper", "walker", "half_cheetah")
 KEPT = ("run", "l1", "noise", "bias", "signs", "policy", "episode", "return", "steps")
 NUMBERS = ("bias", "signs", "episode", "return", "steps")
+CONTROLLERS = ("off", "paper", "robust", "oracle")
 Row = dict[str, Any]
+Disturbance = tuple[float, float]  # bias and signs
+NONE = (0.0, 0.0)
+# Instead of a share, where nothing can be told from chance.
+UNTOLD = "not told"
+# What a pole that hangs returns.
+IDLE = {"inverted_pendulum": -100.0}
+# Policies on which settings of the robust controller were found or chosen.
+TUNED = {
+    "swimmer": ("seed_0",),
+    "hopper": ("seed_0",),
+    "walker": ("seed_0", "seed_1", "seed_2"),
+    "half_cheetah": ("seed_0", "seed_1"),
+}
 
 
 def read(file: Path) -> list[Row]:
@@ -73,81 +87,100 @@ def conditions(episodes: Sequence[Row]) -> list[Row]:
     ]
 
 
-def harm(episodes: Sequence[Row], noise: str, l1: str, draws: int = 4000) -> dict[str, str]:
-    """Return less that without L1: mean over policies, and 95 % interval.
+def of_policies(
+    episodes: Sequence[Row], l1: str, disturbances: Sequence[Disturbance], noise: str = "none"
+) -> dict[str, np.ndarray]:
+    """Returns of a controller under some disturbances, by run."""
+    chosen = set(disturbances)
+    found: dict[str, list[float]] = {}
+    for row in episodes:
+        if (row["l1"], row["noise"]) == (l1, noise) and (row["bias"], row["signs"]) in chosen:
+            found.setdefault(row["run"], []).append(row["return"])
+    return {run: np.array(found[run]) for run in sorted(found)}
+
+
+def difference(
+    episodes: Sequence[Row], l1: str, disturbances: Sequence[Disturbance], noise: str = "none"
+) -> np.ndarray:
+    """Mean return of each policy with a controller less that without."""
+    on, off = (of_policies(episodes, one, disturbances, noise) for one in (l1, "off"))
+    return np.array([on[run].mean() - off[run].mean() for run in off])
+
+
+def with_interval(values: np.ndarray, digits: str) -> str:
+    """Mean over policies, and its 95 % interval by Student's t if there are two or more."""
+    mean = format(values.mean(), digits)
+    if len(values) < 2:
+        return f"{mean} (one policy)"
+    return f"{mean} {student_interval(values.tolist()):{digits}}"
+
+
+def harm(episodes: Sequence[Row], noise: str, l1: str) -> str:
+    """Return less that without L1: mean over policies, and 95 % interval by Student's t.
 
     Both in per cent of the mean magnitude of what the policies return without L1: of returns
     about zero, and of either sign, the mean is no scale.
     """
-    of: dict[tuple[str, str], np.ndarray] = {}
-    runs = sorted({row["run"] for row in episodes})
-    for run in runs:
-        for option in ("off", l1):
-            returns = [
-                row["return"]
-                for row in episodes
-                if (row["run"], row["l1"], row["noise"]) == (run, option, noise)
-                and row["bias"] == 0 == row["signs"]
-            ]
-            of[run, option] = np.array(returns)
-    differences = [of[run, l1] - of[run, "off"] for run in runs]
-    scale = np.mean([abs(of[run, "off"].mean()) for run in runs]) / 100
-    rng = np.random.default_rng(0)
-    means = []
-    for _ in range(draws):
-        chosen = rng.integers(len(runs), size=len(runs))
-        drawn = [rng.choice(differences[one], len(differences[one])).mean() for one in chosen]
-        means.append(np.mean(drawn) / scale)
-    low, high = np.percentile(means, [2.5, 97.5])
-    mean = np.mean([one.mean() for one in differences]) / scale
-    return {"mean": f"{mean:+.1f}", "interval": f"[{low:+.1f}, {high:+.1f}]"}
+    off = of_policies(episodes, "off", [NONE], noise)
+    scale = np.mean([abs(one.mean()) for one in off.values()]) / 100
+    return with_interval(difference(episodes, l1, [NONE], noise) / scale, "+.1f")
 
 
-def overall(episodes: Sequence[Row]) -> dict[str, str]:
-    """What the controllers recover of the disturbances that cost something, of equal weight.
+def idle(task: str, episodes: Sequence[Row]) -> set[str]:
+    """Policies that have learned nothing.
 
-    Those are the ones whose oracle is better than no controller, with its 95 % interval.
+    Their undisturbed return without L1 is less than a tenth of the way from that of doing nothing,
+    which is 0 and the pendulum's -100, to the best policy's.
     """
-    runs = sorted({row["run"] for row in episodes})
-    disturbances = sorted({(row["bias"], row["signs"]) for row in episodes} - {(0.0, 0.0)})
+    returns = {run: one.mean() for run, one in of_policies(episodes, "off", [NONE]).items()}
+    nothing = IDLE.get(task, 0.0)
+    least = nothing + 0.1 * (max(returns.values()) - nothing)
+    return {run for run, value in returns.items() if value < least}
 
-    def returns(l1: str, disturbance: tuple[float, float]) -> list[np.ndarray]:
-        return [
-            np.array(
-                [
-                    row["return"]
-                    for row in episodes
-                    if (row["run"], row["l1"], row["noise"]) == (run, l1, "none")
-                    and (row["bias"], row["signs"]) == disturbance
-                ]
+
+def overall(task: str, episodes: Sequence[Row]) -> dict[str, str]:
+    """What the controllers recover of the disturbances that cost something, and of all.
+
+    The costly ones are those whose oracle is better than no controller, with its 95 % interval;
+    all have equal weight. Shares of single policies are starred where these have learned nothing,
+    and empty where the oracle gains nothing.
+    """
+    disturbances = sorted({(row["bias"], row["signs"]) for row in episodes} - {NONE})
+
+    def shares(l1: str, chosen: Sequence[Disturbance], runs: Iterable[str]) -> Recovery:
+        of = [of_policies(episodes, one, chosen) for one in ("off", l1, "oracle")]
+        return recovered(*([one[run] for run in runs] for one in of))
+
+    useless = idle(task, episodes)
+    runs = list(of_policies(episodes, "off", [NONE]))
+    line = {"policies": str(len(runs)), "learned nothing": ", ".join(sorted(useless)) or "–"}
+    costly = [one for one in disturbances if shares("off", [one], runs).gap_interval.low > 0]
+    line["costly disturbances"] = f"{len(costly)} of {len(disturbances)}"
+    for words, chosen in (("", costly), ("all: ", disturbances)):
+        for l1 in CONTROLLERS:
+            returns = of_policies(episodes, l1, chosen).values()
+            line[words + l1] = f"{np.mean([one.mean() for one in returns]):.4g}" if chosen else "–"
+    line["all: robust less off"] = with_interval(
+        difference(episodes, "robust", disturbances), ".3g"
+    )
+    held_out = [run for run in runs if run not in TUNED.get(task, ())]
+    for l1 in ("paper", "robust"):
+        kinds = {"recovered": runs, "recovered, not tuned on": held_out}
+        for words, chosen_runs in kinds.items():
+            line[f"{l1} {words}"] = UNTOLD if chosen_runs else "–"
+            if costly and chosen_runs:
+                found = shares(l1, costly, chosen_runs)
+                if found.share is not None and found.interval is not None:
+                    text = f"{found.share:.2f} {found.interval:.2f}"
+                    line[f"{l1} {words}"] = text + " over its episodes" * (found.policies == 1)
+        single = []
+        for run in runs if costly else ():
+            off, on, oracle = (
+                of_policies(episodes, one, costly)[run].mean() for one in ("off", l1, "oracle")
             )
-            for run in runs
-        ]
-
-    of = {
-        (l1, disturbance): returns(l1, disturbance)
-        for l1 in ("off", "paper", "robust", "oracle")
-        for disturbance in disturbances
-    }
-    costly = [
-        one
-        for one in disturbances
-        if recovered(of["off", one], of["oracle", one], of["oracle", one]).gap_interval.low > 0
-    ]
-    line = {"costly disturbances": f"{len(costly)} of {len(disturbances)}"}
-
-    def together(l1: str) -> list[np.ndarray]:
-        return [
-            np.concatenate([of[l1, one][index] for one in costly]) for index in range(len(runs))
-        ]
-
-    for l1 in ("off", "paper", "robust", "oracle") if costly else ():
-        line[l1] = f"{np.mean(np.concatenate(together(l1))):.4g}"
-    for l1 in ("paper", "robust") if costly else ():
-        found = recovered(together("off"), together(l1), together("oracle"))
-        assert found.share is not None and found.interval is not None
-        low, high = found.interval.low, found.interval.high
-        line[f"{l1} recovered"] = f"{found.share:.2f} [{low:.2f}, {high:.2f}]"
+            share = f"{(on - off) / (oracle - off):.2f}" if oracle > off else ""
+            single.append(share + r"\*" * (run in useless))
+        line[f"{l1}, by policy"] = ", ".join(single) or "–"
     return line
 
 
@@ -167,18 +200,17 @@ def main() -> None:
         biased = [row for row in summary if row["noise"] == "none"]
         (HERE / f"{task}.md").write_text(markdown(summary_lines(biased)) + "\n")
         plot_heat_map(biased, MEDIANS, task, HERE / f"{task}.png", METRPO.facts)
-        policies = str(len({row["run"] for row in episodes}))
-        totals.append({"task": task, "policies": policies, **overall(episodes)})
+        totals.append({"task": task, **overall(task, episodes)})
         for noise in dict.fromkeys(row["noise"] for row in episodes):
             of = read(more) if more.exists() else episodes
             count = sum(
                 (row["l1"], row["noise"]) == ("off", noise) and row["bias"] == 0 == row["signs"]
                 for row in of
             )
+            policies = str(len({row["run"] for row in of}))
             line = {"task": task, "policies": policies, "noise": noise, "episodes": str(count)}
             for l1 in ("paper", "robust"):
-                found = harm(of, noise, l1)
-                line[f"L1 {l1}, %"] = f"{found['mean']} {found['interval']}"
+                line[f"L1 {l1}, %"] = harm(of, noise, l1)
             lines.append(line)
         for row in biased:
             if row["l1"] == "robust" and "recovered" in row:

@@ -9,6 +9,12 @@ the same policy and controller; with `whole` those of the robust controller alon
 acts on its whole estimate. Writes from those `suite/TASK.md`, one row per disturbance,
 `suite/TASK_values.md`, one row per value of it, `suite/verdicts.md` and `.png`, disturbances by
 tasks, and `suite/changed.md`, what the robust controller's record of its forecasts changes.
+
+Intervals are Student's t and Fieller's, over policies if there are three or more, else over resets.
+The change of the return, as a share of the undisturbed one or of the loss if that is larger,
+decides: *worse* and *helped* are changes of more than 2 % whose 95 % interval excludes 0, and
+*cancelled* is a help that gives back 70 % of the loss. *Not touched* is a change whose interval
+lies within 10 % on either side of 0; of all others one *cannot tell*.
 """
 
 from __future__ import annotations
@@ -22,12 +28,12 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import TwoSlopeNorm
-from scipy.stats import t
+from matplotlib.patches import Patch, Rectangle
 
 from torchrl_l1.envs import DISTURBANCES
 from torchrl_l1.experiment.files import write_table
 from torchrl_l1.report.page import markdown
-from torchrl_l1.report.statistics import Interval, mean_interval
+from torchrl_l1.report.statistics import MIN_SAMPLES, Interval, mean_interval, ratio
 
 HERE = Path(__file__).with_name("suite")
 TASKS = ("inverted_pendulum", "swimmer", "hopper", "walker", "half_cheetah")
@@ -41,7 +47,11 @@ Returns = dict[tuple[str, str, Cell], np.ndarray]
 # A change is worth speaking of from here, as a share of the undisturbed return or of the loss,
 # whichever is larger.
 LEAST = 0.02
+# A change that is certainly smaller is none.
+EQUAL = 0.1
 CANCELLED = 0.7
+VERDICTS = {"cancelled": "●", "helped": "+", "worse": "–", "not touched": "", "cannot tell": ""}
+HATCH = "////"
 # A pole that returns more than this stands still: what is left are thousandths of a radian.
 STANDING = 0.005
 
@@ -96,33 +106,37 @@ def read(task: str) -> Returns:
         }
 
 
-def by_reset(returns: Returns, l1: str, cells: Sequence[Cell]) -> np.ndarray:
-    """Return from each reset: the mean over policies and over cells, whose resets are the same."""
+def sample(returns: Returns, l1: str, cells: Sequence[Cell]) -> np.ndarray:
+    """Mean returns over cells, whose resets are the same.
+
+    Of each policy if there are three or more, else from each reset, over the policies.
+    """
     runs = sorted({key[0] for key in returns})
-    return np.mean([returns[run, l1, cell] for run in runs for cell in cells], axis=0)
+    of = np.array([np.mean([returns[run, l1, cell] for cell in cells], axis=0) for run in runs])
+    return of.mean(axis=1 if len(runs) >= MIN_SAMPLES else 0)
 
 
 def interval_of(values: np.ndarray) -> Interval:
-    """95 % interval of the mean over resets, without bounds if these are fewer than three."""
+    """95 % interval of the mean, without bounds of fewer than three values."""
     return mean_interval(list(values)) or Interval(-np.inf, np.inf)
 
 
 def change(returns: Returns, l1: str, cells: Sequence[Cell]) -> tuple[float, Interval]:
     """Return less that without L1, as a share of its scale, with its interval."""
-    difference = by_reset(returns, l1, cells) - by_reset(returns, "off", cells)
+    difference = sample(returns, l1, cells) - sample(returns, "off", cells)
     shares = difference / scale(returns, cells)
     return float(shares.mean()), interval_of(shares)
 
 
 def scale(returns: Returns, cells: Sequence[Cell]) -> float:
     """Magnitude of the undisturbed return without L1, or of the loss if that is larger."""
-    undisturbed = by_reset(returns, "off", [NONE]).mean()
+    undisturbed = sample(returns, "off", [NONE]).mean()
     return max(float(abs(undisturbed)), float(abs(lost(returns, cells).mean())), STANDING)
 
 
 def lost(returns: Returns, cells: Sequence[Cell]) -> np.ndarray:
-    """What the disturbance costs without L1, by reset."""
-    return by_reset(returns, "off", [NONE]) - by_reset(returns, "off", cells)
+    """What the disturbance costs without L1, by policy or by reset."""
+    return sample(returns, "off", [NONE]) - sample(returns, "off", cells)
 
 
 def regained(returns: Returns, l1: str, cells: Sequence[Cell]) -> tuple[float, Interval] | None:
@@ -130,22 +144,7 @@ def regained(returns: Returns, l1: str, cells: Sequence[Cell]) -> tuple[float, I
     loss = lost(returns, cells)
     if interval_of(loss).low <= 0 or loss.mean() <= LEAST * scale(returns, cells):
         return None
-    return ratio(by_reset(returns, l1, cells) - by_reset(returns, "off", cells), loss)
-
-
-def ratio(above: np.ndarray, below: np.ndarray) -> tuple[float, Interval]:
-    """Of two means over the same resets, with Fieller's 95 % interval.
-
-    Those are the ratios r for which Student's t test does not tell the mean of above - r below
-    from 0: a share is told from 0 where its gain is.
-    """
-    count = len(below)
-    means = np.array([above.mean(), below.mean()])
-    # They are where (1, -r) c (1, -r)' <= 0.
-    c = np.outer(means, means) - t.ppf(0.975, count - 1) ** 2 / count * np.cov(above, below)
-    half = np.sqrt(max(c[0, 1] ** 2 - c[0, 0] * c[1, 1], 0.0))
-    low, high = (c[0, 1] - half) / c[1, 1], (c[0, 1] + half) / c[1, 1]
-    return float(means[0] / means[1]), Interval(float(low), float(high))
+    return ratio(sample(returns, l1, cells) - sample(returns, "off", cells), loss)
 
 
 def verdict(returns: Returns, l1: str, cells: Sequence[Cell]) -> str:
@@ -153,10 +152,11 @@ def verdict(returns: Returns, l1: str, cells: Sequence[Cell]) -> str:
     mean, interval = change(returns, l1, cells)
     if interval.high < 0 and mean < -LEAST:
         return "worse"
-    if not (interval.low > 0 and mean > LEAST):
-        return "not touched"
-    back = regained(returns, l1, cells)
-    return "cancelled" if back is not None and back[0] >= CANCELLED else "helped"
+    if interval.low > 0 and mean > LEAST:
+        back = regained(returns, l1, cells)
+        return "cancelled" if back is not None and back[0] >= CANCELLED else "helped"
+    none = interval.low >= -EQUAL and interval.high <= EQUAL
+    return "not touched" if none else "cannot tell"
 
 
 def table(returns: Returns, groups: Iterable[tuple[str, Sequence[Cell]]]) -> str:
@@ -165,19 +165,15 @@ def table(returns: Returns, groups: Iterable[tuple[str, Sequence[Cell]]]) -> str
     for words, cells in groups:
         line: dict[str, Any] = {"disturbance": words}
         for l1 in ("off", *CONTROLLERS):
-            line[l1] = f"{by_reset(returns, l1, cells).mean():.4g}"
+            line[l1] = f"{sample(returns, l1, cells).mean():.4g}"
         line["loss"] = f"{lost(returns, cells).mean():.4g}" if cells[0] != NONE else ""
         for l1 in CONTROLLERS:
             back = regained(returns, l1, cells)
-            line[f"{l1} gives back"] = _share(*back) if back is not None else ""
+            line[f"{l1} gives back"] = f"{back[0]:.2f} {back[1]:.2f}" if back is not None else ""
         for l1 in ("paper", "robust"):
             line[f"{l1}:"] = verdict(returns, l1, cells)
         lines.append(line)
     return markdown(lines)
-
-
-def _share(share: float, interval: Interval) -> str:
-    return f"{share:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
 
 
 def groups_of(returns: Returns) -> dict[str, list[Cell]]:
@@ -188,8 +184,16 @@ def groups_of(returns: Returns) -> dict[str, list[Cell]]:
 
 
 def changed_by_record(of: dict[str, Returns]) -> str:
-    """Verdicts on the robust controller that its record of forecasts changes: without / with."""
-    of = {task: every for task, every in of.items() if any(key[1] == WHOLE for key in every)}
+    """Verdicts on the robust controller that its record of forecasts changes: without / with.
+
+    Of the policies that were tested both ways.
+    """
+    both_ways = {task: {key[0] for key in every if key[1] == WHOLE} for task, every in of.items()}
+    of = {
+        task: {key: values for key, values in every.items() if key[0] in both_ways[task]}
+        for task, every in of.items()
+        if both_ways[task]
+    }
     lines = []
     for name, entry in DISTURBANCES.items():
         line = {"disturbance": entry.words}
@@ -211,6 +215,17 @@ def changed_by_record(of: dict[str, Returns]) -> str:
     return markdown(lines)
 
 
+def count(word: str, lines: Sequence[dict[str, str]]) -> dict[str, str]:
+    """A line with how often a verdict occurs in each column, by controller."""
+    found = {"disturbance": f"number of *{word}*", "matched": ""}
+    for column in list(lines[0])[2:]:
+        both = zip(
+            *(line[column].split(" / ") for line in lines if line[column] != "–"), strict=True
+        )
+        found[column] = " / ".join(str(verdicts.count(word)) for verdicts in both)
+    return found
+
+
 def plot(of: dict[str, Returns], file: Path) -> None:
     """Changes of the return by the two controllers: disturbances by tasks."""
     names = [name for name in DISTURBANCES if any(name in groups_of(one) for one in of.values())]
@@ -222,7 +237,10 @@ def plot(of: dict[str, Returns], file: Path) -> None:
                 row = names.index(name)
                 shares[row, column] = change(returns, l1, cells)[0]
                 word = verdict(returns, l1, cells)
-                mark = {"cancelled": "●", "helped": "+", "worse": "–"}.get(word, "")
+                if word == "cannot tell":
+                    corner = column - 0.5, row - 0.5
+                    ax.add_patch(Rectangle(corner, 1, 1, fill=False, hatch=HATCH, ec="0.6", lw=0))
+                mark = VERDICTS[word]
                 color = "white" if abs(shares[row, column]) > 0.3 else "black"
                 ax.text(column, row, mark, ha="center", va="center", color=color, weight="bold")
         norm = TwoSlopeNorm(0, -0.5, 0.5)
@@ -231,7 +249,9 @@ def plot(of: dict[str, Returns], file: Path) -> None:
         tasks = [task.replace("_", " ") for task in of]
         ax.set_xticks(range(len(of)), tasks, rotation=30, ha="right")
         ax.set_yticks(range(len(names)), [DISTURBANCES[name].words for name in names])
-    figure.suptitle("● cancelled   + helped   – worse")
+    figure.suptitle("● cancelled   + helped   – worse   no mark: not touched")
+    unknown = Patch(fill=False, hatch=HATCH, ec="0.6", lw=0, label="cannot tell")
+    figure.legend(handles=[unknown], loc="outside lower center", frameon=False)
     figure.colorbar(
         image,
         ax=axes,
@@ -272,7 +292,10 @@ def main() -> None:
             cells = groups.get(name)  # none where it cannot act
             verdicts = [verdict(returns, l1, cells) for l1 in ("paper", "robust") if cells]
             line[column] = " / ".join(verdicts) or "–"
-    (HERE / "verdicts.md").write_text(markdown(list(words.values())) + "\n")
+    lines = list(words.values())
+    (HERE / "verdicts.md").write_text(
+        markdown(lines + [count(word, lines) for word in VERDICTS]) + "\n"
+    )
     (HERE / "changed.md").write_text(changed_by_record(of) + "\n")
     plot(of, HERE / "verdicts.png")
     print(f"Tables and figure: {HERE}")

@@ -94,7 +94,7 @@ def _recovered_words(summary: Sequence[Row]) -> str:
     policies = max((int(row.get("recovered_policies") or 0) for row in summary), default=0)
     if not policies:
         return ""
-    over = "policies and episodes" if policies > 1 else "the episodes of this one policy alone"
+    over = "policies" if policies > 1 else "the episodes of this one policy alone"
     stars = any(float(row.get("gap") or 0.0) < 0 for row in summary)
     words = " (*: the disturbance increases the return; 1 undoes that)" * stars
     return f"; recovered, with its 95 % interval over {over}{words}"

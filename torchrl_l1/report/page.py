@@ -198,10 +198,14 @@ def interval_text(row: Row, name: str) -> str:
     Examples:
         >>> interval_text({"return_low": -1.0, "return_high": 2.5}, "return")
         '[-1, 2.5]'
+        >>> interval_text({"gap_low": -math.inf, "gap_high": math.inf}, "gap")
+        'unbounded'
         >>> interval_text({}, "return")
         '–'
     """
     low, high = row.get(f"{name}_low"), row.get(f"{name}_high")
+    if low == -math.inf and high == math.inf:
+        return "unbounded"
     return "–" if low is None else f"[{number(low)}, {number(high)}]"
 
 

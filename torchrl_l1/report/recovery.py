@@ -26,7 +26,7 @@ from torchrl_l1.report.page import (
     spread_text,
     values_text,
 )
-from torchrl_l1.report.statistics import recovered
+from torchrl_l1.report.statistics import Interval, recovered
 from torchrl_l1.report.study import noise_order
 from torchrl_l1.report.style import (
     arm_label,
@@ -96,8 +96,8 @@ def recovered_text(row: Row) -> str:
     """
     if row.get("recovered") in (None, ""):  # empty in tables read again
         return "–"
-    low, high = (float(row[f"recovered_{side}"]) for side in ("low", "high"))
-    return f"{float(row['recovered']):.2f}{_star(row)} [{low:.2f}, {high:.2f}]"
+    interval = Interval(*(float(row[f"recovered_{side}"]) for side in ("low", "high")))
+    return f"{float(row['recovered']):.2f}{_star(row)} {interval:.2f}"
 
 
 def _star(row: Row) -> str:
@@ -362,15 +362,16 @@ def recovery_section(page: Page, algorithm: AlgorithmFacts, name: str, rows: Seq
     if any(row["l1"] == ORACLE for row in rows):
         page.text(
             "The oracle sends the policy's action less the matched disturbance, clipped: no "
-            "controller can cancel more. *Recovered* is (L1 − off) / (oracle − off) with the 95 % "
-            "interval of a paired bootstrap over policies and their episodes. It is empty where "
-            "the oracle and L1 off do not differ significantly, as for disturbances that no input "
-            "can cancel. A star marks disturbances that increase the return: 1 undoes that."
+            "controller can cancel more. *Recovered* is (L1 − off) / (oracle − off) with Fieller's "
+            "95 % interval over policies. It is empty where the oracle and L1 off do not differ "
+            "significantly, as for disturbances that no input can cancel, and nearly always with "
+            "two or three policies. A star marks disturbances that increase the return: 1 undoes "
+            "that."
         )
     if any(row.get("recovered_policies") == 1 for row in rows):
         page.text(
-            "With one training seed, the interval is over its episodes alone and says nothing "
-            "about other trainings."
+            "With one training seed, the interval is a bootstrap over its episodes alone and says "
+            "nothing about other trainings."
         )
     for heading, words, chosen in training_cells(rows):
         stage = words[-1]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -19,16 +18,26 @@ MIN_SAMPLES = 3
 MIN_INTERQUARTILE = 5
 """With fewer values there is no interquartile mean."""
 
-_MIN_BOOTSTRAP = 10
+_MIN_BOOTSTRAP = 30
 _RESAMPLES = 9999
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A 95 % confidence interval."""
+    """A 95 % confidence interval.
+
+    Examples:
+        >>> f"{Interval(-0.5, 1.25):.2f}", f"{Interval(-np.inf, np.inf):.2f}"
+        ('[-0.50, 1.25]', 'unbounded')
+    """
 
     low: float
     high: float
+
+    def __format__(self, spec: str) -> str:
+        if np.isinf(self.low) and np.isinf(self.high):
+            return "unbounded"
+        return f"[{self.low:{spec}}, {self.high:{spec}}]"
 
 
 def final_return(returns: np.ndarray) -> np.ndarray:
@@ -71,13 +80,27 @@ def interquartile_mean(values: np.ndarray | Sequence[float], axis: int = 0) -> A
     return trim_mean(values, 0.25, axis=axis)
 
 
+def student_interval(values: Sequence[float]) -> Interval:
+    """95 % interval of the mean of two or more values, by Student's t.
+
+    Examples:
+        >>> f"{student_interval([1.0, 2.0, 3.0]):.2f}"
+        '[-0.48, 4.48]'
+    """
+    count = len(values)
+    mean, half = np.mean(values), t.ppf(0.975, count - 1) * np.std(values, ddof=1) / count**0.5
+    return Interval(float(mean - half), float(mean + half))
+
+
 def mean_interval(values: Sequence[float]) -> Interval | None:
     """95 % interval of the mean.
 
-    Student's t for fewer than ten values, for which a bootstrap covers too little: its intervals of
-    three to five values contain the mean some four times in five. From ten values on, the
-    bias-corrected and accelerated bootstrap, or the percentile one where that is undefined. The
-    resampling has a fixed seed: the same values give the same interval.
+    Student's t for fewer than 30 values, for which a bootstrap covers too little. From 30 values
+    on, the bias-corrected and accelerated bootstrap, or the percentile one where that is undefined.
+    Of normal values, Student's t contains the mean in 95 of 100 samples of any size, this
+    bootstrap in 84, 89, 92 and 94 of 100 for 5, 10, 20 and 30 values; of log-normal ones, t in 83,
+    84, 87 and 88, the bootstrap in 75, 84, 87 and 89. The resampling has a fixed seed: the same
+    values give the same interval.
 
     Args:
         values: one value per seed.
@@ -88,21 +111,48 @@ def mean_interval(values: Sequence[float]) -> Interval | None:
     Examples:
         >>> mean_interval([1.0, 2.0]) is None
         True
-        >>> interval = mean_interval([1.0, 2.0, 3.0])
-        >>> round(interval.low, 2), round(interval.high, 2)
-        (-0.48, 4.48)
+        >>> mean_interval([1.0, 2.0, 3.0]) == student_interval([1.0, 2.0, 3.0])
+        True
     """
     count = len(values)
     if count < MIN_SAMPLES:
         return None
-    if count >= _MIN_BOOTSTRAP:
-        return _bootstrap(values, np.mean, "BCa") or _bootstrap(values, np.mean, "percentile")
-    mean, half = np.mean(values), t.ppf(0.975, count - 1) * np.std(values, ddof=1) / count**0.5
-    return Interval(float(mean - half), float(mean + half))
+    if count < _MIN_BOOTSTRAP:
+        return student_interval(values)
+    return _bootstrap(values, np.mean, "BCa") or _bootstrap(values, np.mean, "percentile")
+
+
+def ratio(above: np.ndarray, below: np.ndarray) -> tuple[float, Interval]:
+    """Of the means of paired values, with Fieller's 95 % interval.
+
+    Those are the ratios r for which Student's t test does not tell the mean of above - r below
+    from 0: a share is told from 0 where its gain is. Where the mean of below is not told from 0,
+    they have no bounds.
+
+    Args:
+        above: values ``(n,)``, two or more.
+        below: values of the same seeds.
+
+    Examples:
+        >>> share, interval = ratio(np.array([1.0, 2.0, 3.2]), np.array([2.0, 4.0, 6.0]))
+        >>> f"{share:.2f} {interval:.2f}"
+        '0.52 [0.48, 0.58]'
+    """
+    count = len(below)
+    means = np.array([np.mean(above), np.mean(below)])
+    # They are where (1, -r) c (1, -r)' <= 0.
+    c = np.outer(means, means) - t.ppf(0.975, count - 1) ** 2 / count * np.cov(above, below)
+    if c[1, 1] <= 0:
+        return float(means[0] / means[1]), Interval(-np.inf, np.inf)
+    half = np.sqrt(max(c[0, 1] ** 2 - c[0, 0] * c[1, 1], 0.0))
+    low, high = (c[0, 1] - half) / c[1, 1], (c[0, 1] + half) / c[1, 1]
+    return float(means[0] / means[1]), Interval(float(low), float(high))
 
 
 def interquartile_interval(values: Sequence[float]) -> Interval | None:
     """95 % percentile bootstrap interval of the interquartile mean, as in arXiv 2108.13264.
+
+    Of normal values it contains the mean in 90, 92 and 93 of 100 samples of 5, 8 and 10.
 
     Args:
         values: one value per seed.
@@ -165,14 +215,16 @@ def recovered(
 ) -> Recovery:
     r"""The share :math:`(\bar R_{on} - \bar R_{off}) / (\bar R_{oracle} - \bar R_{off})`.
 
-    Its 95 % interval is that of a paired percentile bootstrap in two stages: policies are drawn
-    with replacement, and within each one its episodes; the same draws are used for all three. Every
-    policy has the same weight. The resampling has a fixed seed.
+    Every policy has the same weight. With two or more policies the 95 % intervals are over their
+    mean returns: Student's t for the gap and :func:`ratio`'s for the share. Simulated with 25
+    episodes each of normally distributed policies that differ, the intervals of both contain the
+    truth in 94 to 96 of 100 cases with two to ten policies. The price is that few policies seldom
+    have a share: for an oracle that gains 1 with a standard deviation of 0.4, 18 of 100 pairs have
+    one, 50 of 100 triples, and 95 of 100 sets of five.
 
-    With fewer than three episodes in total, the interval of the gap is unbounded, and there is no
-    share. With few policies both intervals are too narrow, as for any bootstrap of few values: for
-    an oracle that gains nothing on average, with 25 episodes each of policies that differ, a share
-    is found in 24 of 100 cases with three policies, and in 11 with ten.
+    With one policy both are percentile bootstraps over its episodes, with the same draws for all
+    three; the resampling has a fixed seed. With fewer than three episodes in total, the interval of
+    the gap is unbounded, and there is no share.
 
     If the disturbance increases the return, the gap is negative, and 1 still means that its effect
     is fully undone.
@@ -196,40 +248,36 @@ def recovered(
     sizes = tuple(map(len, off))
     if not sizes or 0 in sizes or {sizes} != {tuple(map(len, one)) for one in (on, oracle)}:
         raise ValueError("recovered() needs the same episodes of the same policies three times")
-    weights = _paired_weights(sizes)
-    plain, gain, gap = (
-        weights @ np.concatenate([np.asarray(one, dtype=np.float64) for one in returns])
-        for returns in (off, on, oracle)
+    gains, gaps = (
+        [np.asarray(mine, dtype=np.float64) - bare for mine, bare in zip(one, off, strict=True)]
+        for one in (on, oracle)
     )
-    gain, gap = gain - plain, gap - plain
-    # Resamples of one or two values tell nothing about other possible values.
-    known = sum(sizes) >= MIN_SAMPLES
-    gap_interval = _percentiles(gap[1:]) if known else Interval(-np.inf, np.inf)
-    found = Recovery(float(gap[0]), gap_interval, None, None, len(sizes))
-    if gap_interval.low <= 0 <= gap_interval.high:
+    gain, gap = (np.array([mine.mean() for mine in one]) for one in (gains, gaps))
+    found = Recovery(float(gap.mean()), Interval(-np.inf, np.inf), None, None, len(sizes))
+    # One or two episodes tell nothing about other possible ones.
+    if sum(sizes) < MIN_SAMPLES:
+        return found
+    if len(sizes) > 1:
+        found = replace(found, gap_interval=student_interval(gap.tolist()))
+        if found.gap_interval.low <= 0 <= found.gap_interval.high:
+            return found
+        share, interval = ratio(gain, gap)
+        return replace(found, share=share, interval=interval)
+    drawn_gain, drawn_gap = (_resampled(one[0]) for one in (gains, gaps))
+    found = replace(found, gap_interval=_percentiles(drawn_gap))
+    if found.gap_interval.low <= 0 <= found.gap_interval.high:
         return found
     with np.errstate(divide="ignore", invalid="ignore"):
-        shares = gain / gap
-    interval = _percentiles(shares[1:][np.isfinite(shares[1:])])
-    return replace(found, share=float(shares[0]), interval=interval)
+        shares = drawn_gain / drawn_gap
+    interval = _percentiles(shares[np.isfinite(shares)])
+    return replace(found, share=float(gain[0] / gap[0]), interval=interval)
 
 
-@cache
-def _paired_weights(sizes: tuple[int, ...]) -> np.ndarray:
-    """Weights of all episodes: the first row gives the mean, the others resampled means.
-
-    Args:
-        sizes: number of episodes of each policy.
-    """
-    rng = np.random.default_rng(0)
-    policies = len(sizes)
-    times = rng.multinomial(policies, [1 / policies] * policies, size=_RESAMPLES)
-    blocks = []
-    for index, size in enumerate(sizes):
-        # A policy drawn k times contributes k resamples of its episodes.
-        drawn = rng.multinomial(times[:, index] * size, [1 / size] * size)
-        blocks.append(np.vstack([np.ones((1, size)), drawn]) / (size * policies))
-    return np.hstack(blocks)
+def _resampled(values: np.ndarray) -> np.ndarray:
+    """Means of resamples, for equal numbers of values of the same ones."""
+    size = len(values)
+    drawn = np.random.default_rng(0).multinomial(size, [1 / size] * size, size=_RESAMPLES)
+    return drawn @ values / size
 
 
 def _percentiles(values: np.ndarray) -> Interval:
