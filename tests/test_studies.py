@@ -109,17 +109,6 @@ def test_readme_shows_what_is_recovered() -> None:
         assert numbers == expected
 
 
-def test_recovered_table_is_that_of_the_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    robust = script("robust", monkeypatch)
-    found = robust.overall(
-        "inverted_pendulum", robust.read(RESULTS / "robust/inverted_pendulum.csv")
-    )
-    shown = overall()["inverted_pendulum"]
-    assert {name: shown[name] for name in found if name in shown} == {
-        name: value for name, value in found.items() if name in shown
-    }
-
-
 def test_first_sentences_of_the_study_quote_the_table() -> None:
     first = section("docs/studies/robustness.md", "# What L1 recovers").partition("\n## ")[0]
     shares = {
@@ -170,26 +159,6 @@ def test_table_of_the_paper_is_that_of_the_runs(
                 checked += 1
     again = [row for row in cells if row["runs of"].endswith(", first training")]
     assert checked == sum(bool(row["difference"]) for row in cells) - len(again) >= 5
-
-
-def test_robust_runs_are_paired_with_the_first_training_on_their_machine() -> None:
-    def returns(file: str, l1: str) -> dict[tuple[str, str], float]:
-        with (RESULTS / file).open(newline="") as handle:
-            return {
-                (row["task"], row["seed"]): float(row["return"])
-                for row in csv.DictReader(handle)
-                if (row["noise"], row["l1"]) == ("none", l1) and not row.get("variant")
-            }
-
-    off, robust = returns("trained_twice.csv", "off"), returns("table1/runs.csv", "robust")
-    shown = {
-        row["task"]: float(row["difference"])
-        for row in rows((RESULTS / "questions/table1.md").read_text())
-        if (row["L1"], row["noise"]) == ("robust", "none")
-    }
-    for task, difference in shown.items():
-        of_seeds = [robust[run] - value for run, value in off.items() if run[0] == task]
-        assert difference == pytest.approx(sum(of_seeds) / len(of_seeds), rel=6e-3), task
 
 
 KEYS = {"task": "task", "noise": "noise", "l1": "L1"}
@@ -439,26 +408,6 @@ def test_theorem_page_quotes_the_residuals_of_the_tasks() -> None:
     walker = shares.pop("walker")
     quoted = f"({walker:.0%} of the residuals on Walker, {min(shares.values()):.0%} and more"
     assert quoted.replace("%", " %") in text
-
-
-def mean_of(seeds: str) -> float:
-    """Of the values of each seed."""
-    values = list(map(float, seeds.split(",")))
-    return sum(values) / len(values)
-
-
-def test_offline_page_and_the_advice_quote_what_robust_costs_hopper() -> None:
-    found = {
-        row["data"]: {l1: mean_of(row[l1]) for l1 in ("off", "robust")}
-        for row in rows((RESULTS / "offline/returns.md").read_text())
-        if (row["task"], row["bias"]) == ("hopper", "none") and row["data"] != "random"
-    }
-    text = " ".join((ROOT / "docs/studies/offline.md").read_text().split())
-    for of in found.values():
-        assert f"{of['robust']:.0f} against {of['off']:.0f}" in text
-        assert 0.55 < 1 - of["robust"] / of["off"] < 0.65
-    for page in ("README.md", "docs/studies/index.md", "docs/studies/offline.md"):
-        assert "three fifths" in (ROOT / page).read_text(), page
 
 
 def test_robustness_page_quotes_the_rules_by_which_it_acts() -> None:

@@ -18,7 +18,7 @@ import torch
 from matplotlib.figure import Figure
 from scipy.stats import ttest_1samp
 
-from tests.test_studies import RESULTS, ROOT, rows, script
+from tests.test_studies import RESULTS, ROOT, overall, rows, script
 from torchrl_l1.algorithms.collection import ORACLE, make_pipeline
 from torchrl_l1.control import L1Config, kalman_law
 from torchrl_l1.control.kalman import Posterior
@@ -281,6 +281,57 @@ def test_offline_learning_has_intervals_and_shares_from_three_seeds_on(
         low, high = ttest_1samp([2.5, 12.5, 22.5], 0.0).confidence_interval()
         assert (row["return_low"], row["return_high"]) == pytest.approx((low, high))
         assert line["robust recovers"] == "0.50 [0.50, 0.50]"
+
+
+def test_robust_runs_are_paired_with_the_first_training_on_their_machine() -> None:
+    def returns(file: str, l1: str) -> dict[tuple[str, str], float]:
+        with (RESULTS / file).open(newline="") as handle:
+            return {
+                (row["task"], row["seed"]): float(row["return"])
+                for row in csv.DictReader(handle)
+                if (row["noise"], row["l1"]) == ("none", l1) and not row.get("variant")
+            }
+
+    off, robust = returns("trained_twice.csv", "off"), returns("table1/runs.csv", "robust")
+    shown = {
+        row["task"]: float(row["difference"])
+        for row in rows((RESULTS / "questions/table1.md").read_text())
+        if (row["L1"], row["noise"]) == ("robust", "none")
+    }
+    for task, difference in shown.items():
+        of_seeds = [robust[run] - value for run, value in off.items() if run[0] == task]
+        assert difference == pytest.approx(sum(of_seeds) / len(of_seeds), rel=6e-3), task
+
+
+def test_recovered_table_is_that_of_the_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    robust = script("robust", monkeypatch)
+    found = robust.overall(
+        "inverted_pendulum", robust.read(RESULTS / "robust/inverted_pendulum.csv")
+    )
+    shown = overall()["inverted_pendulum"]
+    assert {name: shown[name] for name in found if name in shown} == {
+        name: value for name, value in found.items() if name in shown
+    }
+
+
+def mean_of(seeds: str) -> float:
+    """Of the values of each seed."""
+    values = list(map(float, seeds.split(",")))
+    return sum(values) / len(values)
+
+
+def test_offline_page_and_the_advice_quote_what_robust_costs_hopper() -> None:
+    found = {
+        row["data"]: {l1: mean_of(row[l1]) for l1 in ("off", "robust")}
+        for row in rows((RESULTS / "offline/returns.md").read_text())
+        if (row["task"], row["bias"]) == ("hopper", "none") and row["data"] != "random"
+    }
+    text = " ".join((ROOT / "docs/studies/offline.md").read_text().split())
+    for of in found.values():
+        assert f"{of['robust']:.0f} against {of['off']:.0f}" in text
+        assert 0.55 < 1 - of["robust"] / of["off"] < 0.65
+    for page in ("README.md", "docs/studies/index.md", "docs/studies/offline.md"):
+        assert "three fifths" in (ROOT / page).read_text(), page
 
 
 CONFIG = L1Config.robust(0.02, action_low=-1.0, action_high=1.0)

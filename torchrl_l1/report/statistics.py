@@ -134,9 +134,11 @@ def ratio(above: np.ndarray, below: np.ndarray) -> tuple[float, Interval]:
         below: values of the same seeds.
 
     Examples:
-        >>> share, interval = ratio(np.array([1.0, 2.0, 3.2]), np.array([2.0, 4.0, 6.0]))
+        >>> share, interval = ratio(np.array([4.0, 6.0, 5.0]), np.array([9.0, 10.0, 11.0]))
         >>> f"{share:.2f} {interval:.2f}"
-        '0.52 [0.48, 0.58]'
+        '0.50 [0.28, 0.72]'
+        >>> f"{ratio(np.array([4.0, 6.0, 5.0]), np.array([-1.0, 0.0, 2.0]))[1]:.2f}"
+        'unbounded'
     """
     count = len(below)
     means = np.array([np.mean(above), np.mean(below)])
