@@ -40,6 +40,7 @@ SCALES = {
 }
 # Whose returns are compared.
 ACTIONS = {"stochastic": "sampled", "deterministic": "mean"}
+RETURNS = {"stochastic": "return", "deterministic": "return_deterministic"}
 ENDS = ("difference_low", "difference_high")
 Row = dict[str, str]
 
@@ -98,7 +99,7 @@ def rows(folder: str, name: str) -> list[Row]:
         return list(csv.DictReader(handle))
 
 
-def ours(table: Table, task: str, noise: str, l1: str) -> Found | None:
+def ours(table: Table, task: str, noise: str, l1: str, policy: str = "stochastic") -> Found | None:
     """Of a table's editions that have the cell the one with most pairs, or the latest of these."""
     best = None
     single: dict[str, list[float]] = {}
@@ -108,9 +109,9 @@ def ours(table: Table, task: str, noise: str, l1: str) -> Found | None:
             for row in rows(edition, "training.csv")
             if (row["task"], row["noise"]) == (task, noise) and not row["variant"]
         }
-        pair = paired(edition, (task, noise, l1), "stochastic")
+        pair = paired(edition, (task, noise, l1), policy)
         for arm in ("off", l1) if pair else ():
-            of_seeds = seed_returns(edition, (task, noise, arm), pair[0]["seeds"].split(), l1)
+            of_seeds = seed_returns(edition, (task, noise, arm), pair[0], l1)
             returns[arm] = str(np.mean(of_seeds))
             single[arm] = of_seeds
         if l1 == "robust" and pair:
@@ -136,27 +137,24 @@ def paired(edition: str, cell: tuple[str, str, str], policy: str) -> list[Row]:
     ]
 
 
-def first_training(task: str, noise: str, l1: str) -> Row:
-    """Returns of the runs of a cell that have been trained a second time, by seed."""
+def first_training(task: str, noise: str, l1: str) -> dict[str, Row]:
+    """The runs of a cell that have been trained a second time, by seed."""
     cell = {"task": task, "noise": noise, "l1": l1}
     return {
-        row["seed"]: row["return"]
-        for row in rows("", "trained_twice.csv")
-        if row.items() >= cell.items()
+        row["seed"]: row for row in rows("", "trained_twice.csv") if row.items() >= cell.items()
     }
 
 
-def seed_returns(
-    edition: str, cell: tuple[str, str, str], seeds: Sequence[str], l1: str
-) -> list[float]:
-    """Returns of the runs of a cell that have these seeds.
+def seed_returns(edition: str, cell: tuple[str, str, str], pair: Row, l1: str) -> list[float]:
+    """Returns of the runs of a cell that have the seeds of a pair, by its kind of action.
 
     The robust runs come from the machine of the first training. What they are compared with is
     that training where a second has replaced it.
     """
     first = first_training(*cell) if (edition, l1) == ("table1", "robust") else {}
+    seeds, column = pair["seeds"].split(), RETURNS[pair["policy"]]
     found = {
-        row["seed"]: float(first.get(row["seed"], row["return"]))
+        row["seed"]: float(first.get(row["seed"], row)[column])
         for row in rows(edition, "runs.csv")
         if (row["task"], row["noise"], row["l1"]) == cell and not row["variant"]
         if row["return"] and row["seed"] in seeds
@@ -259,13 +257,12 @@ def ahead() -> None:
         cells: list[bool] = []
         signs: dict[str, list[bool]] = {group: [] for group in groups}
         for task, noise in product(SCALES, NOISES):
-            found = ours(table, task, noise, l1)
+            found = ours(table, task, noise, l1, policy)
             if found is None or found.pair is None:
                 continue
-            [pair] = paired(found.edition, (task, noise, l1), policy)
-            differences = map(float, pair["differences"].split())
+            differences = map(float, found.pair["differences"].split())
             higher = [difference > 0 for difference in differences if difference]
-            cells.append(float(pair["difference_mean"]) > 0)
+            cells.append(float(found.pair["difference_mean"]) > 0)
             for group in (pairs, signs[task.replace("_", " ")], signs[f"noise {noise}"]):
                 group.extend(higher)
         ends = binomtest(sum(cells), len(cells)).proportion_ci()
