@@ -18,7 +18,7 @@ import torch
 from matplotlib.figure import Figure
 from scipy.stats import ttest_1samp
 
-from tests.test_studies import RESULTS, ROOT, overall, rows, script
+from tests.test_studies import RESULTS, ROOT, rows, script
 from torchrl_l1.algorithms.collection import ORACLE, make_pipeline
 from torchrl_l1.control import L1Config, kalman_law
 from torchrl_l1.control.kalman import Posterior
@@ -127,67 +127,78 @@ def test_no_model_lies_outside_the_figure(
             assert low < min(line.get_xdata()) and max(line.get_xdata()) < high
 
 
-def biased(returns: dict[str, dict[str, float]]) -> list[dict[str, Any]]:
-    """Episodes without a disturbance, all of 100, and of a bias, by controller and policy."""
+def biased(returns: dict[str, tuple[float, ...]], scatter: float = 1.0) -> list[dict[str, Any]]:
+    """Episodes of a policy under each of two biases, by controller: 100 undisturbed."""
+    resets = (-scatter, 0.0, scatter)
     return [
-        {"run": run, "l1": l1, "noise": "none", "bias": bias, "signs": 0.0, "return": value}
-        for run, of in returns.items()
-        for l1, under_bias in of.items()
-        for bias, value in ((0.0, 100.0), *((0.2, under_bias + one) for one in (-1, 0, 1)))
+        {"run": "seed_0", "l1": l1, "noise": "none", "bias": bias, "signs": 0.0}
+        | {"episode": float(episode), "return": (value if bias else 100.0) + reset}
+        for l1, of in returns.items()
+        for bias, value in zip((0.0, 0.2, -0.2), (0.0, *of), strict=True)
+        for episode, reset in enumerate(resets)
     ]
 
 
-def test_shares_of_few_policies_are_told_only_where_they_agree(
+def test_a_policy_recovers_a_share_of_what_certainly_costs_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     robust = script("robust", monkeypatch)
-    gaps = np.array([10.0, 12.0, 11.0])
-    returns = {
-        f"seed_{seed}": {"off": 50.0, "paper": 50.0, "robust": 50 + 0.5 * gap, "oracle": 50 + gap}
-        for seed, gap in enumerate(gaps)
-    }
-    line = robust.overall("task", biased(returns))
-    assert line["robust recovered"] == "0.50 [0.50, 0.50]"
-    assert line["robust, by policy"] == "0.50, 0.50, 0.50"
-    low, high = ttest_1samp(gaps / 2, 0.0).confidence_interval()
-    assert line["all: robust less off"] == f"{gaps.mean() / 2:.3g} [{low:.3g}, {high:.3g}]"
-    # The oracle's gain, 0.3, 10 and 20, is not told from 0 by three policies.
-    returns["seed_0"]["oracle"], returns["seed_2"]["oracle"] = 50.3, 70.0
-    line = robust.overall("task", biased(returns))
-    assert (line["costly disturbances"], line["robust recovered"]) == ("0 of 1", robust.UNTOLD)
-    alone = robust.overall("task", biased({"seed_0": returns["seed_1"]}))
-    assert alone["all: robust less off"] == "6 (one policy)"
-    assert alone["robust recovered"].endswith("] over its episodes")
+    returns = {"off": (50.0, 99.0), "paper": (45.0, 0.0), "robust": (80.0, 0.0)}
+    # The second bias costs 1 % of 100, too little to speak of.
+    [row] = robust.policy_rows(biased(returns | {"oracle": (90.0, 100.0)}))
+    assert row["costly"] == [(0.2, 0.0)]
+    assert row["share robust"][0] == pytest.approx(30 / 40)
+    assert row["share paper"][0] == pytest.approx(-5 / 40)
+    assert (row["off"], row["all robust"], row["undisturbed"]) == pytest.approx((50, 40, 100))
+    # Of an oracle that is better at two resets of three nothing is certain.
+    episodes = biased(returns | {"oracle": (90.0, 100.0)})
+    for one in episodes:
+        if (one["l1"], one["bias"]) == ("oracle", 0.2):
+            one["return"] += (-80.0, 30.0, 50.0)[int(one["episode"])]
+    [row] = robust.policy_rows(episodes)
+    assert row["costly"] == [] and row["off"] is None
+    line = robust.overall("task", [row])
+    assert (line["of them with costly biases"], line["robust recovers"]) == ("0", "–")
 
 
-def test_policies_that_have_learned_nothing_are_marked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shares_have_fiellers_interval_over_resets(monkeypatch: pytest.MonkeyPatch) -> None:
     robust = script("robust", monkeypatch)
+    rng = np.random.default_rng(0)
+    episodes = biased({"off": (0, 0), "paper": (0, 0), "robust": (20, 30), "oracle": (40, 40)})
+    for one in episodes:
+        one["return"] += rng.normal()
+    [row] = robust.policy_rows(episodes)
+    of = {
+        l1: np.mean(
+            [[o["return"] for o in episodes if (o["l1"], o["bias"]) == (l1, bias)]
+             for bias in (0.2, -0.2)], 0,
+        )
+        for l1 in ("off", "robust", "oracle")
+    }  # fmt: skip
+    _, ends = row["share robust"]
+    for end in (ends.low, ends.high):
+        # At its ends a t test of gain - share * gap just tells them apart.
+        left = of["robust"] - of["off"] - end * (of["oracle"] - of["off"])
+        assert ttest_1samp(left, 0.0).pvalue == pytest.approx(0.05)
 
-    def idle(task: str, *returns: float) -> set[str]:
-        rows = [
-            {"run": f"seed_{seed}", "l1": "off", "noise": "none", "bias": 0.0, "signs": 0.0}
-            | {"return": value}
-            for seed, value in enumerate(returns)
-        ]
-        return robust.idle(task, rows)
 
-    assert idle("hopper", 900.0, -328.0, 89.0, 91.0) == {"seed_1", "seed_2"}
-    assert idle("inverted_pendulum", -0.001, -9.0, -95.0) == {"seed_2"}
-
-
-def test_returns_of_either_sign_do_not_shrink_what_harm_is_measured_by(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_harm_is_that_of_the_mean_and_of_the_worst_policy(monkeypatch: pytest.MonkeyPatch) -> None:
     robust = script("robust", monkeypatch)
     returns = {"good": {"off": 100.0, "paper": 80.0}, "bad": {"off": -60.0, "paper": -60.0}}
+    scatter = (-3.0, 0.0, 6.0)
     episodes = [
-        {"run": run, "l1": l1, "noise": "none", "bias": 0.0, "signs": 0.0, "return": value}
+        {"run": run, "l1": l1, "noise": "none", "bias": 0.0, "signs": 0.0, "episode": episode}
+        | {"return": value + (scatter[episode] if l1 == "paper" else 0.0)}
         for run, of in returns.items()
         for l1, value in of.items()
+        for episode in range(3)
     ]
-    # -20 and 0, of 100 and 60.
-    low, high = ttest_1samp([-25.0, 0.0], 0.0).confidence_interval()
-    assert robust.harm(episodes, "none", "paper") == f"-12.5 [{low:+.1f}, {high:+.1f}]"
+    # -19 of 100, and 1 of 60.
+    low, high = ttest_1samp([-23.0, -20.0, -14.0], 0.0).confidence_interval()
+    assert robust.harm(episodes, "none", "paper") == {
+        "paper, mean, %": f"{(-19 + 100 / 60) / 2:+.1f}",
+        "paper, worst policy, %": f"-19.0 [{low:+.1f}, {high:+.1f}] (good)",
+    }
 
 
 def write(file: Path, rows: Sequence[dict[str, Any]]) -> None:
@@ -301,17 +312,6 @@ def test_robust_runs_are_paired_with_the_first_training_on_their_machine() -> No
     for task, difference in shown.items():
         of_seeds = [robust[run] - value for run, value in off.items() if run[0] == task]
         assert difference == pytest.approx(sum(of_seeds) / len(of_seeds), rel=6e-3), task
-
-
-def test_recovered_table_is_that_of_the_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    robust = script("robust", monkeypatch)
-    found = robust.overall(
-        "inverted_pendulum", robust.read(RESULTS / "robust/inverted_pendulum.csv")
-    )
-    shown = overall()["inverted_pendulum"]
-    assert {name: shown[name] for name in found if name in shown} == {
-        name: value for name, value in found.items() if name in shown
-    }
 
 
 def mean_of(seeds: str) -> float:

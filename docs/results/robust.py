@@ -6,14 +6,14 @@ Reads the tables that `torchrl-l1 evaluate` wrote into FOLDER/TASK/seed_N/bias a
 FOLDER is given, and keeps their episodes in `robust/TASK.csv` beside this file, in place of those
 of the same policy. More episodes without a disturbance, of tasks whose returns scatter much, are in
 .../undisturbed and are kept in `robust/undisturbed_TASK.csv`. Writes from those `robust/TASK.md`,
-`robust/TASK.png`, `robust/overall.md` and `robust/harm.md`.
+`robust/TASK.png`, `robust/policies.md`, `robust/overall.md` and `robust/harm.md`.
 """
 
 from __future__ import annotations
 
 import csv
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +23,9 @@ from torchrl_l1.algorithms import METRPO
 from torchrl_l1.experiment.files import write_table
 from torchrl_l1.experiment.matrix import disturbance_words
 from torchrl_l1.report.evaluation_summary import summarize, summary_lines
-from torchrl_l1.report.page import markdown
+from torchrl_l1.report.page import markdown, number
 from torchrl_l1.report.recovery import MEDIANS, plot_heat_map
-from torchrl_l1.report.statistics import Recovery, recovered, student_interval
+from torchrl_l1.report.statistics import ratio, student_interval
 
 HERE = Path(__file__).with_name("robust")
 TASKS = ("inverted_pendulum", "swimmer", "hopper", "walker", "half_cheetah")
@@ -35,17 +35,9 @@ CONTROLLERS = ("off", "paper", "robust", "oracle")
 Row = dict[str, Any]
 Disturbance = tuple[float, float]  # bias and signs
 NONE = (0.0, 0.0)
-# Instead of a share, where nothing can be told from chance.
-UNTOLD = "not told"
-# What a pole that hangs returns.
-IDLE = {"inverted_pendulum": -100.0}
+LEAST = 0.02  # of the undisturbed return, from which on a loss is spoken of
 # Policies on which settings of the robust controller were found or chosen.
-TUNED = {
-    "swimmer": ("seed_0",),
-    "hopper": ("seed_0",),
-    "walker": ("seed_0", "seed_1", "seed_2"),
-    "half_cheetah": ("seed_0", "seed_1"),
-}
+TUNED = {"swimmer": ("seed_0",), "hopper": ("seed_0",), "walker": ("seed_0",)}
 
 
 def read(file: Path) -> list[Row]:
@@ -87,107 +79,118 @@ def conditions(episodes: Sequence[Row]) -> list[Row]:
     ]
 
 
-def of_policies(
-    episodes: Sequence[Row], l1: str, disturbances: Sequence[Disturbance], noise: str = "none"
-) -> dict[str, np.ndarray]:
-    """Returns of a controller under some disturbances, by run."""
-    chosen = set(disturbances)
-    found: dict[str, list[float]] = {}
-    for row in episodes:
-        if (row["l1"], row["noise"]) == (l1, noise) and (row["bias"], row["signs"]) in chosen:
-            found.setdefault(row["run"], []).append(row["return"])
-    return {run: np.array(found[run]) for run in sorted(found)}
-
-
-def difference(
-    episodes: Sequence[Row], l1: str, disturbances: Sequence[Disturbance], noise: str = "none"
+def returns(
+    episodes: Sequence[Row], run: str, l1: str, disturbances: Sequence[Disturbance], noise: str
 ) -> np.ndarray:
-    """Mean return of each policy with a controller less that without."""
-    on, off = (of_policies(episodes, one, disturbances, noise) for one in (l1, "off"))
-    return np.array([on[run].mean() - off[run].mean() for run in off])
+    """Returns of a policy, reset by reset, in the mean over the disturbances."""
+    of: dict[float, list[float]] = {}
+    for row in episodes:
+        is_of = (row["run"], row["l1"], row["noise"]) == (run, l1, noise)
+        if is_of and (row["bias"], row["signs"]) in disturbances:
+            of.setdefault(row["episode"], []).append(row["return"])
+    return np.array([np.mean(of[episode]) for episode in sorted(of)])
 
 
-def with_interval(values: np.ndarray, digits: str) -> str:
-    """Mean over policies, and its 95 % interval by Student's t if there are two or more."""
-    mean = format(values.mean(), digits)
-    if len(values) < 2:
-        return f"{mean} (one policy)"
-    return f"{mean} {student_interval(values.tolist()):{digits}}"
+def policy_rows(episodes: Sequence[Row]) -> list[Row]:
+    """What each policy loses under the biases that cost it something, and what it gets back.
 
-
-def harm(episodes: Sequence[Row], noise: str, l1: str) -> str:
-    """Return less that without L1: mean over policies, and 95 % interval by Student's t.
-
-    Both in per cent of the mean magnitude of what the policies return without L1: of returns
-    about zero, and of either sign, the mean is no scale.
+    Those are the ones at which the oracle is better than no controller, by more than 2 % of the
+    magnitude of what the policy returns undisturbed, and with its 95 % interval over the resets.
+    Their returns are means of equal weight, the intervals Student's t and Fieller's over resets.
     """
-    off = of_policies(episodes, "off", [NONE], noise)
-    scale = np.mean([abs(one.mean()) for one in off.values()]) / 100
-    return with_interval(difference(episodes, l1, [NONE], noise) / scale, "+.1f")
+    rows = []
+    for run in sorted({row["run"] for row in episodes}):
+        every = {(row["bias"], row["signs"]) for row in episodes if row["run"] == run} - {NONE}
 
+        def of(
+            l1: str, disturbances: Sequence[Disturbance], noise: str = "none", run: str = run
+        ) -> np.ndarray:
+            return returns(episodes, run, l1, disturbances, noise)
 
-def idle(task: str, episodes: Sequence[Row]) -> set[str]:
-    """Policies that have learned nothing.
-
-    Their undisturbed return without L1 is less than a tenth of the way from that of doing nothing,
-    which is 0 and the pendulum's -100, to the best policy's.
-    """
-    returns = {run: one.mean() for run, one in of_policies(episodes, "off", [NONE]).items()}
-    nothing = IDLE.get(task, 0.0)
-    least = nothing + 0.1 * (max(returns.values()) - nothing)
-    return {run for run, value in returns.items() if value < least}
-
-
-def overall(task: str, episodes: Sequence[Row]) -> dict[str, str]:
-    """What the controllers recover of the disturbances that cost something, and of all.
-
-    The costly ones are those whose oracle is better than no controller, with its 95 % interval;
-    all have equal weight. Shares of single policies are starred where these have learned nothing,
-    and empty where the oracle gains nothing.
-    """
-    disturbances = sorted({(row["bias"], row["signs"]) for row in episodes} - {NONE})
-
-    def shares(l1: str, chosen: Sequence[Disturbance], runs: Iterable[str]) -> Recovery:
-        of = [of_policies(episodes, one, chosen) for one in ("off", l1, "oracle")]
-        return recovered(*([one[run] for run in runs] for one in of))
-
-    useless = idle(task, episodes)
-    runs = list(of_policies(episodes, "off", [NONE]))
-    line = {"policies": str(len(runs)), "learned nothing": ", ".join(sorted(useless)) or "–"}
-    costly = [one for one in disturbances if shares("off", [one], runs).gap_interval.low > 0]
-    line["costly disturbances"] = f"{len(costly)} of {len(disturbances)}"
-    for words, chosen in (("", costly), ("all: ", disturbances)):
+        undisturbed = of("off", [NONE])
+        least = LEAST * abs(undisturbed.mean())
+        costly = []
+        for one in sorted(every):
+            gap = of("oracle", [one]) - of("off", [one])
+            if gap.mean() > least and student_interval(gap.tolist()).low > 0:
+                costly.append(one)
+        row: Row = {"run": run, "undisturbed": undisturbed.mean(), "costly": costly}
         for l1 in CONTROLLERS:
-            returns = of_policies(episodes, l1, chosen).values()
-            line[words + l1] = f"{np.mean([one.mean() for one in returns]):.4g}" if chosen else "–"
-    line["all: robust less off"] = with_interval(
-        difference(episodes, "robust", disturbances), ".3g"
-    )
-    held_out = [run for run in runs if run not in TUNED.get(task, ())]
+            row[f"all {l1}"] = of(l1, sorted(every)).mean()
+            row[l1] = of(l1, costly).mean() if costly else None
+        for l1 in ("paper", "robust") if costly else ():
+            off = of("off", costly)
+            row[f"share {l1}"] = ratio(of(l1, costly) - off, of("oracle", costly) - off)
+        rows.append(row)
+    return rows
+
+
+def policy_lines(task: str, rows: Sequence[Row]) -> list[Row]:
+    """:func:`policy_rows` in words."""
+    lines = []
+    for row in rows:
+        line = {"task": task, "policy": row["run"].replace("_", " ")}
+        line |= {"undisturbed": number(row["undisturbed"])}
+        line["costly biases"] = f"{len(row['costly'])} of 6"
+        for l1 in CONTROLLERS:
+            line[l1] = "–" if row[l1] is None else number(row[l1])
+        for l1 in ("paper", "robust"):
+            share = row.get(f"share {l1}")
+            line[f"{l1} recovers"] = f"{share[0]:.2f} {share[1]:.2f}" if share else "–"
+        lines.append(line)
+    return lines
+
+
+def spread(values: Sequence[float], digits: str) -> str:
+    """Median and range over policies."""
+    if not values:
+        return "–"
+    ends = f"[{min(values):{digits}}, {max(values):{digits}}]"
+    return f"{float(np.median(values)):{digits}} {ends}"
+
+
+def overall(task: str, rows: Sequence[Row]) -> dict[str, str]:
+    """The policies of a task together: shares, and means over all six biases.
+
+    Shares are medians over the policies that lose something, with the lowest and the highest.
+    """
+    line = {"policies": str(len(rows))}
+    losing = [row for row in rows if row["costly"]]
+    line["of them with costly biases"] = str(len(losing))
     for l1 in ("paper", "robust"):
-        kinds = {"recovered": runs, "recovered, not tuned on": held_out}
-        for words, chosen_runs in kinds.items():
-            line[f"{l1} {words}"] = UNTOLD if chosen_runs else "–"
-            if costly and chosen_runs:
-                found = shares(l1, costly, chosen_runs)
-                if found.share is not None and found.interval is not None:
-                    text = f"{found.share:.2f} {found.interval:.2f}"
-                    line[f"{l1} {words}"] = text + " over its episodes" * (found.policies == 1)
-        single = []
-        for run in runs if costly else ():
-            off, on, oracle = (
-                of_policies(episodes, one, costly)[run].mean() for one in ("off", l1, "oracle")
-            )
-            share = f"{(on - off) / (oracle - off):.2f}" if oracle > off else ""
-            single.append(share + r"\*" * (run in useless))
-        line[f"{l1}, by policy"] = ", ".join(single) or "–"
+        line[f"{l1} recovers"] = spread([row[f"share {l1}"][0] for row in losing], ".2f")
+    held_out = [row for row in losing if row["run"] not in TUNED.get(task, ())]
+    line["robust, not tuned on"] = spread([row["share robust"][0] for row in held_out], ".2f")
+    for l1 in CONTROLLERS:
+        line[f"all six: {l1}"] = number(float(np.mean([row[f"all {l1}"] for row in rows])))
+    gains = [row["all robust"] - row["all off"] for row in rows]
+    line["robust less off"] = ", ".join(map(number, gains))
     return line
+
+
+def harm(episodes: Sequence[Row], noise: str, l1: str) -> dict[str, str]:
+    """Return less that without L1, in per cent of its magnitude: mean over policies, and the worst.
+
+    That of the worst has its 95 % interval over episodes, by Student's t.
+    """
+    changes = {}
+    for run in sorted({row["run"] for row in episodes}):
+        on, off = (returns(episodes, run, one, [NONE], noise) for one in (l1, "off"))
+        changes[run] = (on - off) / abs(off.mean()) * 100
+    run, worst = min(changes.items(), key=lambda item: float(item[1].mean()))
+    mean = np.mean([one.mean() for one in changes.values()])
+    interval = student_interval(worst.tolist())
+    return {
+        f"{l1}, mean, %": f"{mean:+.1f}",
+        f"{l1}, worst policy, %": f"{worst.mean():+.1f} {interval:+.1f} ({run.replace('_', ' ')})",
+    }
 
 
 def main() -> None:
     """Read what is new, then write all tables and figures."""
     lines: list[Row] = []
     totals: list[Row] = []
+    policies: list[Row] = []
     for task in TASKS:
         file, more = HERE / f"{task}.csv", HERE / f"undisturbed_{task}.csv"
         if len(sys.argv) > 1:
@@ -200,22 +203,26 @@ def main() -> None:
         biased = [row for row in summary if row["noise"] == "none"]
         (HERE / f"{task}.md").write_text(markdown(summary_lines(biased)) + "\n")
         plot_heat_map(biased, MEDIANS, task, HERE / f"{task}.png", METRPO.facts)
-        totals.append({"task": task, **overall(task, episodes)})
+        rows = policy_rows(episodes)
+        policies += policy_lines(task, rows)
+        totals.append({"task": task, **overall(task, rows)})
         for noise in dict.fromkeys(row["noise"] for row in episodes):
             of = read(more) if more.exists() else episodes
             count = sum(
                 (row["l1"], row["noise"]) == ("off", noise) and row["bias"] == 0 == row["signs"]
                 for row in of
             )
-            policies = str(len({row["run"] for row in of}))
-            line = {"task": task, "policies": policies, "noise": noise, "episodes": str(count)}
+            runs = len({row["run"] for row in of})
+            line = {"task": task, "policies": str(runs), "noise": noise}
+            line["episodes of each"] = str(count // runs)
             for l1 in ("paper", "robust"):
-                line[f"L1 {l1}, %"] = harm(of, noise, l1)
+                line |= harm(of, noise, l1)
             lines.append(line)
         for row in biased:
             if row["l1"] == "robust" and "recovered" in row:
                 print(task, disturbance_words(row), f"{row['recovered']:.2f}")
     (HERE / "overall.md").write_text(markdown(totals) + "\n")
+    (HERE / "policies.md").write_text(markdown(policies) + "\n")
     (HERE / "harm.md").write_text(markdown(lines) + "\n")
     print(f"Tables and figures: {HERE}")
 

@@ -1,14 +1,14 @@
 """The suite of disturbances on frozen policies: off, the paper's, the robust one, the oracle.
 
     python docs/results/suite.py [FOLDER]
-    python docs/results/suite.py whole FOLDER
+    python docs/results/suite.py earlier FOLDER
 
 Reads the episodes that `torchrl-l1 evaluate --suite full` wrote into FOLDER/TASK/seed_N, if a
 FOLDER is given, and keeps their returns in `suite/TASK.csv` beside this file, in place of those of
-the same policy and controller; with `whole` those of the robust controller alone, as that which
-acts on its whole estimate. Writes from those `suite/TASK.md`, one row per disturbance,
+the same policy and controller; with `earlier` those of the robust controller alone, as its
+earlier version. Writes from those `suite/TASK.md`, one row per disturbance,
 `suite/TASK_values.md`, one row per value of it, `suite/verdicts.md` and `.png`, disturbances by
-tasks, and `suite/changed.md`, what the robust controller's record of its forecasts changes.
+tasks, and `suite/changed.md`, where the robust controller's verdicts differ from the earlier ones.
 
 Intervals are Student's t and Fieller's, over policies if there are three or more, else over resets.
 The change of the return, as a share of the undisturbed one or of the loss if that is larger,
@@ -38,7 +38,7 @@ from torchrl_l1.report.statistics import MIN_SAMPLES, Interval, mean_interval, r
 HERE = Path(__file__).with_name("suite")
 TASKS = ("inverted_pendulum", "swimmer", "hopper", "walker", "half_cheetah")
 CONTROLLERS = ("paper", "robust", "oracle")
-WHOLE = "whole"  # the robust controller with skill_forgetting=1
+EARLIER = "earlier"  # the robust controller that took changes for noise
 NONE = ("none", 0.0)
 Cell = tuple[str, float]
 # Returns of the episodes, by policy, controller and (disturbance, value).
@@ -183,12 +183,12 @@ def groups_of(returns: Returns) -> dict[str, list[Cell]]:
     return {name: cells for name, cells in groups.items() if cells}
 
 
-def changed_by_record(of: dict[str, Returns]) -> str:
-    """Verdicts on the robust controller that its record of forecasts changes: without / with.
+def changed(of: dict[str, Returns]) -> str:
+    """Verdicts on the robust controller that have changed: the earlier one / this one.
 
     Of the policies that were tested both ways.
     """
-    both_ways = {task: {key[0] for key in every if key[1] == WHOLE} for task, every in of.items()}
+    both_ways = {task: {key[0] for key in every if key[1] == EARLIER} for task, every in of.items()}
     of = {
         task: {key: values for key, values in every.items() if key[0] in both_ways[task]}
         for task, every in of.items()
@@ -199,7 +199,7 @@ def changed_by_record(of: dict[str, Returns]) -> str:
         line = {"disturbance": entry.words}
         for task, returns in of.items():
             cells = groups_of(returns).get(name)
-            both = [verdict(returns, l1, cells) for l1 in (WHOLE, "robust") if cells]
+            both = [verdict(returns, l1, cells) for l1 in (EARLIER, "robust") if cells]
             line[task.replace("_", " ")] = " / ".join(both) if len(set(both)) == 2 else ""
         if any(list(line.values())[1:]):
             lines.append(line)
@@ -208,7 +208,7 @@ def changed_by_record(of: dict[str, Returns]) -> str:
         for task, returns in of.items():
             counts = [
                 sum(verdict(returns, l1, cells) in kinds for cells in groups_of(returns).values())
-                for l1 in (WHOLE, "robust")
+                for l1 in (EARLIER, "robust")
             ]
             line[task.replace("_", " ")] = " / ".join(map(str, counts))
         lines.append(line)
@@ -268,8 +268,8 @@ def main() -> None:
     of: dict[str, Returns] = {}
     for task in TASKS:
         match sys.argv[1:]:
-            case ["whole", folder]:
-                gather(Path(folder), task, {"robust": WHOLE})
+            case ["earlier", folder]:
+                gather(Path(folder), task, {"robust": EARLIER})
             case [folder]:
                 gather(Path(folder), task)
         if (HERE / f"{task}.csv").exists():
@@ -296,7 +296,7 @@ def main() -> None:
     (HERE / "verdicts.md").write_text(
         markdown(lines + [count(word, lines) for word in VERDICTS]) + "\n"
     )
-    (HERE / "changed.md").write_text(changed_by_record(of) + "\n")
+    (HERE / "changed.md").write_text(changed(of) + "\n")
     plot(of, HERE / "verdicts.png")
     print(f"Tables and figure: {HERE}")
 
