@@ -90,7 +90,7 @@ def message(error: BaseException) -> str:
         text = _of_hydra(text, str(cause) if isinstance(cause, OmegaConfBaseException) else "")
     elif isinstance(error, OmegaConfBaseException):
         text = _of_hydra(text, "")
-    line = " ".join(text.split())
+    line = " ".join(text.split()) or type(error).__name__
     return line if len(line) <= _LONGEST else line[:_LONGEST] + " ..."
 
 
