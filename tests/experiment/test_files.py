@@ -1,4 +1,4 @@
-"""What reads files of settings."""
+"""What reads files of settings, and what writes files."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
+from torchrl_l1.atomic import keep_file, write_atomically
 from torchrl_l1.experiment import files
-from torchrl_l1.experiment.files import bounded_overrides, settings_content
+from torchrl_l1.experiment.files import bounded_overrides, make_place, settings_content
 
 WORDS = """
 yes No on off true ~ null .inf -.INF .NaN 2020-01-01 1e-3 1_000 0x1F 010 0b11 1:30 1:30.5
@@ -64,3 +65,30 @@ def test_overrides_name_a_folder_below_that_of_the_recipe(value: str) -> None:
     name = bounded_overrides(f"horizon=5,dataset={value}")
     folder = os.path.normpath(f"runs/mine/{name}/seed_0")
     assert folder.startswith("runs/mine/horizon=5,")
+
+
+def test_writers_of_one_place_do_not_meet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One begins and ends while the other is about to replace the file."""
+    sync = os.fsync
+
+    def meet(write: Any) -> None:
+        def other_first(descriptor: int) -> None:
+            monkeypatch.setattr(os, "fsync", sync)
+            write()
+            sync(descriptor)
+
+        monkeypatch.setattr(os, "fsync", other_first)
+
+    meet(lambda: write_atomically(tmp_path / "a.csv", "others"))
+    write_atomically(tmp_path / "a.csv", "mine")
+    meet(lambda: make_place(tmp_path / "b.csv"))
+    make_place(tmp_path / "c.csv")
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {"a.csv": "mine"}
+
+
+def test_a_second_name_of_a_file_leaves_no_third(tmp_path: Path) -> None:
+    file, second = tmp_path / "file", tmp_path / "second"
+    file.write_text("content")
+    for _ in range(2):
+        keep_file(file, second)
+    assert sorted(tmp_path.iterdir()) == [file, second]

@@ -114,7 +114,7 @@ def make_folder(folder: Path) -> None:
     probe = folder / ".writable"
     try:
         write_atomically(probe, "")
-        probe.unlink()
+        probe.unlink(missing_ok=True)  # another process may have done so
     except OSError as error:
         raise type(error)(error.errno, error.strerror, str(folder)) from error
 
