@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import example, given
@@ -13,7 +15,8 @@ from omegaconf import OmegaConf
 
 from torchrl_l1.atomic import keep_file, write_atomically
 from torchrl_l1.experiment import files
-from torchrl_l1.experiment.files import bounded_overrides, make_place, settings_content
+from torchrl_l1.experiment.errors import message
+from torchrl_l1.experiment.files import bounded_overrides, locked, make_place, settings_content
 
 WORDS = """
 yes No on off true ~ null .inf -.INF .NaN 2020-01-01 1e-3 1_000 0x1F 010 0b11 1:30 1:30.5
@@ -84,6 +87,18 @@ def test_writers_of_one_place_do_not_meet(tmp_path: Path, monkeypatch: pytest.Mo
     meet(lambda: make_place(tmp_path / "b.csv"))
     make_place(tmp_path / "c.csv")
     assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {"a.csv": "mine"}
+
+
+def test_a_file_system_without_locks_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the system call says it, on which the lock of any library rests."""
+    fcntl = pytest.importorskip("fcntl")
+    refused = OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+    monkeypatch.setattr(fcntl, "flock", Mock(side_effect=refused))
+    with pytest.raises(OSError, match=f"{tmp_path}.*lock") as refusal, locked(tmp_path / ".lock"):
+        pass
+    assert "mounted with flock" in message(refusal.value)
 
 
 def test_a_second_name_of_a_file_leaves_no_third(tmp_path: Path) -> None:

@@ -54,7 +54,11 @@ USER_ERRORS = (
 )
 
 _SPACE = "free some space; nothing is lost, and the same command continues"
+_LOCKS = "this file system has no locks; choose another one, or have it mounted with flock"
 _REMEDIES = {
+    errno.ENOSYS: _LOCKS,
+    errno.ENOLCK: _LOCKS,
+    errno.EOPNOTSUPP: _LOCKS,
     errno.ENOSPC: _SPACE,
     errno.EDQUOT: _SPACE,
     errno.EROFS: "choose a place that can be written to",
