@@ -303,6 +303,7 @@ def evaluate_command(options: argparse.Namespace) -> None:
     output = Path(options.output) if options.output else runs[0].path / folder
     if not options.output:
         refuse_link(output)
+    _check_results(output)
     make_folder(output)
     rows, episodes = [], []
     total = len(runs) * len(cells)
