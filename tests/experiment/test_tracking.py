@@ -40,7 +40,7 @@ from torchrl_l1.experiment.tracking import (
     log_evaluation,
     trackers,
 )
-from torchrl_l1.experiment.wandb_files import ID_FILE, known_id, whole_records
+from torchrl_l1.experiment.wandb_files import ID_FILE, draw_id, known_id, whole_records
 
 Recipe = Callable[..., DictConfig]
 OFFLINE = "wandb.mode=offline"
@@ -187,6 +187,34 @@ def test_an_evaluation_that_weights_and_biases_refuses_is_told(
         said: list[str] = []
         log_evaluation(recipe, tmp_path, Evaluated("evaluation", []), said.append)
         assert said == [f"{tmp_path}: evaluation is not logged: {words}"]
+
+
+def test_a_kill_between_the_tables_costs_no_evaluation(tmp_path: Path) -> None:
+    drawn = draw_id(tmp_path)
+    (tmp_path / "config.yaml").touch()
+    (tmp_path / "metrics.csv").write_text("iteration\n0\n")
+    (tmp_path / "timing.csv").write_text("iteration,fit\n0,2.5\n1,3.5\n")
+    recipe = METRPORecipe(wandb=WandbSettings(mode="offline"))
+    said: list[str] = []
+    log_evaluation(recipe, tmp_path, Evaluated("evaluation", [{"bias": 0.0}]), said.append)
+    assert said == [] and known_id(tmp_path) == drawn
+    (file,) = wandb_files(tmp_path)
+    training, evaluation = file.history
+    assert (training["iteration"], training["seconds/fit"]) == (0, 2.5)
+    assert evaluation["evaluation/_type"] == "table-file"
+
+
+def test_wandb_without_a_home_folder_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a container with the number of a user that it does not know."""
+    pwd = pytest.importorskip("pwd")
+    monkeypatch.setattr(pwd, "getpwuid", Mock(side_effect=KeyError))
+    monkeypatch.delenv("HOME", raising=False)
+    for mode in ("auto", "offline", "online"):
+        with pytest.raises(ValueError, match="set HOME"):
+            check_wandb_mode(mode)
+    check_wandb_mode("disabled")
+    monkeypatch.setenv("WANDB_MODE", "disabled")
+    check_wandb_mode("auto")
 
 
 def test_a_mode_of_the_environment_that_there_is_not_is_named(

@@ -49,7 +49,7 @@ def check_wandb_mode(mode: str) -> None:
     """Make sure that W&B can be used in a mode.
 
     Raises:
-        ValueError: for an unknown mode, or one that needs a missing API key.
+        ValueError: for an unknown mode, or one that needs a missing API key or home folder.
     """
     if mode not in MODES:
         raise ValueError(f"wandb.mode must be one of {', '.join(MODES)}, got {mode!r}")
@@ -59,6 +59,11 @@ def check_wandb_mode(mode: str) -> None:
             f"WANDB_MODE={here}: it must be one of {', '.join(_WANDB_MODES)}; or set wandb.mode"
         )
     setting, asked = ("WANDB_MODE", here) if mode == "auto" else ("wandb.mode", mode)
+    if asked != "disabled":
+        try:
+            Path.home()  # as in containers with the number of a user that they do not know
+        except RuntimeError as error:
+            raise ValueError("W&B needs a home folder: set HOME, or wandb.mode=disabled") from error
     if asked in _ONLINE and not _has_key():
         raise ValueError(
             f"{setting}={asked} needs an API key; log in with wandb login or set WANDB_API_KEY, or "
@@ -452,6 +457,7 @@ def log_evaluation(
                 return
             # Missing rows of the training come first.
             metrics, timings = (_rows(run_dir / f"{name}.csv") for name in ("metrics", "timing"))
+            timings = timings[: len(metrics)]  # written first: a kill may leave one more
             with trackers(now, run_dir, config, metrics, timings, say) as opened:
                 for tracker in opened:
                     tracker.evaluation(evaluated)
