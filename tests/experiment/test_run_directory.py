@@ -101,6 +101,14 @@ def test_data_that_have_changed_since_a_run_began_are_known(tmp_path: Path) -> N
     assert run.changed_files(config, data=True) == []
 
 
+def test_files_of_the_system_occupy_no_directory(tmp_path: Path) -> None:
+    for name in (".DS_Store", ".nfs00000000a1b2c3d400000001"):
+        (tmp_path / name).touch()
+    assert RunDirectory(tmp_path).free()
+    (tmp_path / ".profile").touch()
+    assert not RunDirectory(tmp_path).free()
+
+
 def test_what_a_kill_has_left_is_removed_where_a_run_begins(tmp_path: Path) -> None:
     for name in ("config.yaml.0123abcd.tmp", "config.yaml.tmp", "versions.json"):
         (tmp_path / name).touch()

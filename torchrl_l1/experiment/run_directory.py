@@ -35,8 +35,12 @@ from torchrl_l1.experiment.provenance import (
     versions,
 )
 
-# Files that a run killed in its first moments may leave; its directory is still free.
-_BEFORE_CONFIG = (".lock", "versions.json", "versions.json.tmp", "config.yaml.tmp", TEMPORARY)
+# Files that a run killed in its first moments, a file manager and NFS may leave; the directory is
+# still free.
+_BEFORE_CONFIG = (
+    *(".lock", "versions.json", "versions.json.tmp", "config.yaml.tmp", TEMPORARY),
+    *(".DS_Store", ".nfs*"),
+)
 
 # Settings that may change when a run continues and that matter to its later use.
 _RENEWED = (MAY_GROW, "search_path")
