@@ -30,6 +30,7 @@ from torchrl_l1.campaign.description import read_campaign
 from torchrl_l1.campaign.plan import plan
 from torchrl_l1.cli import main
 from torchrl_l1.experiment import tracking
+from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.settings import METRPORecipe, WandbSettings
@@ -404,6 +405,18 @@ def test_a_process_of_wandb_that_dies_costs_one_line(tmp_path: Path) -> None:
         tracker.log(*rows[0])
     assert len(said) == 3 and len(wandb_files(tmp_path / "next")[0].history) == 1
     gc.collect()
+
+
+def test_a_process_of_wandb_that_does_not_start_is_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(wandb, "init", Mock(side_effect=ConnectionResetError))
+    recipe = METRPORecipe(wandb=WandbSettings(mode="offline"))
+    with (
+        pytest.raises(RunDirectoryError, match="W&B: ConnectionResetError; use"),
+        trackers(recipe, tmp_path, {}, [], []),
+    ):
+        pass
 
 
 def kill_wandb() -> None:
