@@ -140,6 +140,16 @@ def test_a_closed_pipe_is_told_in_a_line() -> None:
     assert ended.stderr == "torchrl-l1 recipes: the reader of the output has exited\n"
 
 
+@pytest.mark.parametrize("name", ["stdout", "stderr"])
+@pytest.mark.parametrize("command", ["recipes", "run metrpo/inverted_pendulum --cfg job"])
+def test_a_stream_that_was_never_open_is_not_needed(
+    command: str, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, name, None)
+    main(command.split())
+    getattr(sys, name).close()
+
+
 @pytest.mark.parametrize("more", [[], ["-m", "seed=0,1"]])
 def test_a_run_has_one_option_of_a_group(
     more: list[str], capsys: pytest.CaptureFixture[str]

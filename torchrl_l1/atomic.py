@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import secrets
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -11,12 +12,15 @@ from pathlib import Path
 # Links are followed where a system lacks this, as Windows does, where few may make any.
 NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
 
+TEMPORARY = f"*.{8 * '[0-9a-f]'}.tmp"
+"""Pattern of the names under which files are written before they replace others."""
+
 
 def write_atomically(file: Path, content: str | bytes, keep: Path | None = None) -> None:
     """Replace a file in one step.
 
-    The target, and what an earlier attempt may have left beside it, are replaced where they are
-    links: nothing is written through them.
+    A link in its place is replaced: nothing is written through it. Several processes may write the
+    file at once; it is that of the last.
 
     Args:
         file: the file.
@@ -26,10 +30,9 @@ def write_atomically(file: Path, content: str | bytes, keep: Path | None = None)
     Raises:
         OSError: with the name of the file, which is as it was.
     """
-    temporary = file.with_name(file.name + ".tmp")
+    temporary = _beside(file)
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | NO_FOLLOW | getattr(os, "O_BINARY", 0)
     try:
-        temporary.unlink(missing_ok=True)
         with os.fdopen(os.open(temporary, flags, 0o666), "wb") as handle:
             handle.write(content if isinstance(content, bytes) else _utf8(content))
             handle.flush()
@@ -38,9 +41,15 @@ def write_atomically(file: Path, content: str | bytes, keep: Path | None = None)
             keep_file(file, keep)
         os.replace(temporary, file)
     except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(file)) from error
+    finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-        raise type(error)(error.errno, error.strerror, str(file)) from error
+
+
+def _beside(file: Path) -> Path:
+    """A name beside a file that no other process uses, not even one of another machine."""
+    return file.with_name(f"{file.name}.{secrets.token_hex(4)}.tmp")
 
 
 def _utf8(text: str) -> bytes:
@@ -70,8 +79,7 @@ def keep_file(file: Path, at: Path, moved: bool = True) -> None:
         at: the other place; what is there is replaced in one step.
         moved: whether the file may be gone afterwards where there are no hard links.
     """
-    second = at.with_name(at.name + ".tmp")
-    second.unlink(missing_ok=True)
+    second = _beside(at)
     try:
         os.link(file, second)
     except OSError:
@@ -80,4 +88,7 @@ def keep_file(file: Path, at: Path, moved: bool = True) -> None:
         else:
             write_atomically(at, file.read_bytes())
     else:
-        os.replace(second, at)
+        try:
+            os.replace(second, at)
+        finally:  # it is still there where both were the same file
+            second.unlink(missing_ok=True)

@@ -24,7 +24,7 @@ from torchrl_l1.campaign.evaluation import evaluate_run, is_evaluated
 from torchrl_l1.campaign.jobs import sweep
 from torchrl_l1.campaign.plan import PlannedRun, plan
 from torchrl_l1.campaign.progress import overview
-from torchrl_l1.campaign.workers import TEMPORARY_FAILURE
+from torchrl_l1.campaign.workers import TAKEN
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.files import locked
@@ -268,7 +268,7 @@ def test_run_that_lost_its_directory_says_so_to_the_workers(campaign_file: Path)
         pytest.raises(SystemExit) as exit_info,
     ):
         child.train({**this.settings(), "resume": True})
-    assert exit_info.value.code == TEMPORARY_FAILURE
+    assert exit_info.value.code == TAKEN
 
 
 def test_time_left_goes_by_real_steps(

@@ -15,13 +15,14 @@ from unittest.mock import Mock
 import pytest
 
 from torchrl_l1.campaign.workers import (
-    TEMPORARY_FAILURE,
+    TAKEN,
     Job,
     Stopped,
     Unfinished,
     Workers,
     available_cores,
 )
+from torchrl_l1.experiment.shutdown import RESUME_ME
 
 MakeJob = Callable[..., Job]
 
@@ -106,10 +107,19 @@ def test_tries_again_if_another_process_was_quicker(make_job: MakeJob, tmp_path:
     ended: list[str] = []
     # The first attempt finds that another process has the directory, which then ends at once: by
     # the time the workers look, nobody holds it any more.
-    script = f"test -e {started} || {{ touch {started}; exit {TEMPORARY_FAILURE}; }}"
+    script = f"test -e {started} || {{ touch {started}; exit {TAKEN}; }}"
     job = make_job(script, lambda: ended.append("done") or [])
     assert workers(1).work([job]) == []
     assert ended == ["done"]
+
+
+def test_a_process_that_was_asked_to_make_room_is_not_started_again(
+    make_job: MakeJob, tmp_path: Path
+) -> None:
+    started = tmp_path / "started"
+    (failure,) = workers(1).work([make_job(f"echo once >> {started}; exit {RESUME_ME}")])
+    assert "has made room, as it was asked" in str(failure)
+    assert started.read_text() == "once\n"
 
 
 def test_good_end_without_the_work_is_a_failure(make_job: MakeJob) -> None:

@@ -156,9 +156,10 @@ def test_the_printed_use_has_the_parts_of_the_observation_in_the_policy_s_order(
     assert names["env"].reset()["observation"].tolist() == [-7.0, 1.0]
 
 
-def test_what_weights_and_biases_refuses_costs_no_result(robust, monkeypatch, capsys):
+@pytest.mark.parametrize("error", [wandb.errors.UsageError, ConnectionResetError, TimeoutError])
+def test_what_weights_and_biases_refuses_costs_no_result(error, robust, monkeypatch, capsys):
     def init(**options):
-        raise wandb.errors.UsageError("api_key not configured")
+        raise error("api_key not configured")
 
     monkeypatch.setattr(wandb, "init", init)
     monkeypatch.setattr(robustify, "robustify", lambda *_, **__: robust)

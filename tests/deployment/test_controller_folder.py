@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchrl_l1.deployment import RobustController, environment_source
-from torchrl_l1.deployment.controller_folder import check_replaces
+from torchrl_l1.deployment.controller_folder import check_replaces, check_runs_nothing
 
 
 @pytest.mark.parametrize("content", ["[]", "3", "{}", '{"format": 1}', "{", '{"format": 7}', ""])
@@ -31,3 +31,15 @@ def test_other_weights_make_another_policy(robust, policy_file, tmp_path, monkey
             check_replaces(folder, "inverted_pendulum", name, None, weights)
     RobustController.load("controller").save("again")
     check_replaces(Path("again"), "inverted_pendulum", name, None, "a.pt")
+
+
+def test_a_colon_in_the_path_of_a_run_is_no_code(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("2026-12-01_04:30/run", "sb3:model.zip"):
+        Path(name).mkdir(parents=True)
+    for run in ("2026-12-01_04:30/run", str(tmp_path / "2026-12-01_04:30/run")):
+        check_runs_nothing(tmp_path, {"environment": "inverted_pendulum", "policy": run})
+    # A folder of that name does not hide that the pickle would be read.
+    for code in ("2026-12-01_04:30/none", "own.py:balance", "sb3:model.zip"):
+        with pytest.raises(ValueError, match="give --trust"):
+            check_runs_nothing(tmp_path, {"environment": "inverted_pendulum", "policy": code})

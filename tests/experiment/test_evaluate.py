@@ -124,12 +124,28 @@ def test_an_option_may_stand_several_times(tiny_recipe: Recipe) -> None:
 def test_pictures_of_another_evaluation_do_not_stay(tiny_recipe: Recipe, tmp_path: Path) -> None:
     directory, output = run(tiny_recipe("l1=off", "outer_iterations=1")), tmp_path / "out"
     output.mkdir()
-    for name in ("returns.png", "recovered.png", "robustness.png", "filmstrip.png", "mine.png"):
+    pictures = ("returns.png", "recovered.png", "robustness.png", "filmstrip.png", "mine.png")
+    for name in (*pictures, "evaluation.csv"):
         (output / name).write_text("of another one")
     options = ["--l1", "off", "--episodes", "1", "--output", str(output)]
     main(["evaluate", str(directory), *options])
     assert {file.name for file in output.glob("*.png")} == {"robustness.png", "mine.png"}
     assert matplotlib.image.imread(output / "robustness.png").std() > 0
+
+
+def test_files_of_no_evaluation_are_neither_deleted_nor_replaced(
+    tiny_recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    directory = run(tiny_recipe("l1=off", "outer_iterations=1"))
+    for name in ("filmstrip.png", "summary.csv"):
+        file = tmp_path / f"with {name}" / name
+        file.parent.mkdir()
+        file.write_text("mine")
+        options = ["--l1", "off", "--episodes", "1", "--output", str(file.parent)]
+        with pytest.raises(SystemExit):
+            main(["evaluate", str(directory), *options])
+        assert f"{file} already exists" in capsys.readouterr().err
+        assert file.read_text() == "mine" and list(file.parent.iterdir()) == [file]
 
 
 def test_a_path_that_is_no_utf8_costs_no_evaluation(tiny_recipe: Recipe, tmp_path: Path) -> None:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 import re
 import signal
+import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +28,7 @@ from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.launch import compose
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.run_directory import RunDirectory
-from torchrl_l1.experiment.shutdown import RESUME_ME, orderly_end
+from torchrl_l1.experiment.shutdown import RESUME_ME, asked_to_make_room, orderly_end
 from torchrl_l1.objectives import NonFiniteAdvantages
 from torchrl_l1.objectives.gaussian_trpo import _GaussianProblem
 from torchrl_l1.report import report
@@ -208,6 +211,42 @@ def test_a_signal_ends_the_run_in_order(
     assert capsys.readouterr().err.count(f"torchrl-l1: stopped by {name}\n") == 1
     assert closed == [1] and signal.getsignal(number) == before
     assert len(rows(tmp_path / "run")) == 1
+
+
+@pytest.mark.parametrize("state", ["read-only", "a closed pipe", "closed", "never open"])
+def test_a_signal_is_obeyed_where_its_line_cannot_be_written(
+    state: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = os.dup(2)
+    try:
+        if state == "read-only":
+            with open(os.devnull, "rb") as unwritable:
+                os.dup2(unwritable.fileno(), 2)
+        elif state == "a closed pipe":
+            reader, writer = os.pipe()
+            os.close(reader)
+            os.dup2(writer, 2)
+            os.close(writer)
+        else:
+            os.close(2)
+        stream = None if state == "never open" else sys.__stderr__
+        for name in ("stderr", "__stderr__"):
+            monkeypatch.setattr(sys, name, stream)
+        file = tmp_path / "file"
+        # Where there is no standard error, the next file opened takes its number.
+        with (
+            open(file, "wb") if stream is None else nullcontext(),
+            pytest.raises(SystemExit) as exit_info,
+            orderly_end(),
+        ):
+            signal.raise_signal(signal.SIGUSR1)
+            asked = asked_to_make_room()
+            signal.raise_signal(signal.SIGTERM)
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+    assert asked and exit_info.value.code == 143
+    assert not file.exists() or not file.read_bytes()
 
 
 def test_a_second_signal_is_not_caught() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,13 @@ import pytest
 import yaml
 from hydra.core.plugins import Plugins
 
+import torchrl_l1
 from torchrl_l1.campaign.description import CampaignError, read_campaign
 from torchrl_l1.campaign.plan import plan
 from torchrl_l1.cli import main
 from torchrl_l1.experiment.errors import RecipeError
 from torchrl_l1.experiment.launch import compose, launch
+from torchrl_l1.experiment.recipes import recipes_dir
 
 PENDULUM = "metrpo/inverted_pendulum"
 OWN = "defaults: [metrpo_recipe, _self_]\nrecipe: own\ntask: inverted_pendulum\n"
@@ -212,6 +215,20 @@ def test_names_that_lead_elsewhere_are_refused(
     line_of(["campaign", str(file), "--list"], capsys)
     assert "not .yml" in line_of(["run", "own.yml"], capsys)
     assert {path.name for path in tmp_path.iterdir()} == {"mine.yaml", "...yaml"}
+
+
+def test_the_package_may_lie_where_there_is_an_apostrophe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["run", "metrpo/inverted_pendulum", "l1=paper", "--cfg", "job"]
+    main(command)
+    expected = capsys.readouterr().out
+    home = tmp_path / "o'brien"
+    shutil.copytree(recipes_dir(), home / "recipes")
+    monkeypatch.setattr(torchrl_l1, "__file__", str(home / "torchrl_l1" / "__init__.py"))
+    assert recipes_dir() == home / "recipes"
+    main(command)
+    assert capsys.readouterr().out == expected
 
 
 def test_launch_needs_a_recipe_that_there_is() -> None:

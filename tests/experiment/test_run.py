@@ -273,6 +273,7 @@ def test_interrupted_write_leaves_the_old_file(
     with pytest.raises(KeyboardInterrupt):
         write_atomically(file, saved({"iteration": 2}))
     assert torch.load(file, weights_only=True) == {"iteration": 1}
+    assert list(tmp_path.iterdir()) == [file]
 
 
 @pytest.mark.parametrize(

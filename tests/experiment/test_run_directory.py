@@ -101,6 +101,26 @@ def test_data_that_have_changed_since_a_run_began_are_known(tmp_path: Path) -> N
     assert run.changed_files(config, data=True) == []
 
 
+def test_files_of_the_system_occupy_no_directory(tmp_path: Path) -> None:
+    for name in (".DS_Store", ".nfs00000000a1b2c3d400000001"):
+        (tmp_path / name).touch()
+    assert RunDirectory(tmp_path).free()
+    (tmp_path / ".profile").touch()
+    assert not RunDirectory(tmp_path).free()
+
+
+def test_what_a_kill_has_left_is_removed_where_a_run_begins(tmp_path: Path) -> None:
+    for name in ("config.yaml.0123abcd.tmp", "config.yaml.tmp", "versions.json"):
+        (tmp_path / name).touch()
+    with RunDirectory(tmp_path).open({"seed": 0}, resume=False):
+        left = (tmp_path / "checkpoint.pt.89abcdef.tmp", tmp_path / "notes.tmp")
+        for file in left:
+            file.touch()
+    with RunDirectory(tmp_path).open({"seed": 0}, resume=True):
+        assert [file.exists() for file in left] == [False, True]
+    assert not (tmp_path / "config.yaml.0123abcd.tmp").exists()
+
+
 def test_a_directory_is_refused_before_any_data_are_read(tmp_path: Path) -> None:
     (tmp_path / "letter.txt").write_text("mine")
     overrides = ["dataset=nowhere.npz", f"run_dir={tmp_path}", "wandb.mode=disabled"]

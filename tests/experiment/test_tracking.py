@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import csv
+import gc
+import os
 import random
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import wandb
@@ -17,12 +22,15 @@ from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 from wandb.proto import wandb_internal_pb2
 
+from tests.conftest import HAS_FORKS
+from tests.kills import descendants
 from tests.wandb_files import problems, wandb_files
 from tests.wandb_server import wandb_server
 from torchrl_l1.campaign.description import read_campaign
 from torchrl_l1.campaign.plan import plan
 from torchrl_l1.cli import main
 from torchrl_l1.experiment import tracking
+from torchrl_l1.experiment.errors import RunDirectoryError
 from torchrl_l1.experiment.evaluate import load_run
 from torchrl_l1.experiment.run import run
 from torchrl_l1.experiment.settings import METRPORecipe, WandbSettings
@@ -33,7 +41,7 @@ from torchrl_l1.experiment.tracking import (
     log_evaluation,
     trackers,
 )
-from torchrl_l1.experiment.wandb_files import ID_FILE, known_id, whole_records
+from torchrl_l1.experiment.wandb_files import ID_FILE, draw_id, known_id, whole_records
 
 Recipe = Callable[..., DictConfig]
 OFFLINE = "wandb.mode=offline"
@@ -165,17 +173,49 @@ def test_online_by_the_environment_needs_a_key_too(
 def test_an_evaluation_that_weights_and_biases_refuses_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(*_: object) -> None:
-        raise wandb.errors.CommError("no network")
+    class Abandoned(Exception):
+        """Like W&B's errors about its own process, of no common class and without words."""
 
-    monkeypatch.setattr(tracking, "_used", lambda *_: ["wandb"])
-    monkeypatch.setattr(tracking, "trackers", refuse)
-    for name in ("metrics.csv", "timing.csv", "config.yaml"):
-        (tmp_path / name).touch()
+    for error, words in (
+        (wandb.errors.CommError("no network"), "no network"),
+        (Abandoned(), "Abandoned"),
+    ):
+        monkeypatch.setattr(tracking, "_used", lambda *_: ["wandb"])
+        monkeypatch.setattr(tracking, "trackers", Mock(side_effect=error))
+        for name in ("metrics.csv", "timing.csv", "config.yaml"):
+            (tmp_path / name).touch()
+        recipe = METRPORecipe(wandb=WandbSettings(mode="offline"))
+        said: list[str] = []
+        log_evaluation(recipe, tmp_path, Evaluated("evaluation", []), said.append)
+        assert said == [f"{tmp_path}: evaluation is not logged: {words}"]
+
+
+def test_a_kill_between_the_tables_costs_no_evaluation(tmp_path: Path) -> None:
+    drawn = draw_id(tmp_path)
+    (tmp_path / "config.yaml").touch()
+    (tmp_path / "metrics.csv").write_text("iteration\n0\n")
+    (tmp_path / "timing.csv").write_text("iteration,fit\n0,2.5\n1,3.5\n")
     recipe = METRPORecipe(wandb=WandbSettings(mode="offline"))
     said: list[str] = []
-    log_evaluation(recipe, tmp_path, Evaluated("evaluation", []), said.append)
-    assert said == [f"{tmp_path}: evaluation is not logged: no network"]
+    log_evaluation(recipe, tmp_path, Evaluated("evaluation", [{"bias": 0.0}]), said.append)
+    assert said == [] and known_id(tmp_path) == drawn
+    (file,) = wandb_files(tmp_path)
+    training, evaluation = file.history
+    assert (training["iteration"], training["seconds/fit"]) == (0, 2.5)
+    assert evaluation["evaluation/_type"] == "table-file"
+
+
+def test_wandb_without_a_home_folder_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a container with the number of a user that it does not know."""
+    pwd = pytest.importorskip("pwd")
+    monkeypatch.setattr(pwd, "getpwuid", Mock(side_effect=KeyError))
+    monkeypatch.delenv("HOME", raising=False)
+    for mode in ("auto", "offline", "online"):
+        with pytest.raises(ValueError, match="set HOME"):
+            check_wandb_mode(mode)
+    check_wandb_mode("disabled")
+    monkeypatch.setenv("WANDB_MODE", "disabled")
+    check_wandb_mode("auto")
 
 
 def test_a_mode_of_the_environment_that_there_is_not_is_named(
@@ -310,6 +350,95 @@ def test_a_run_that_is_logged_online_is_completed_when_it_goes_on(
     assert list(server.history) == [drawn]
     steps = [(row["_step"], row["iteration"]) for row in server.history[drawn].values()]
     assert steps == [(0, 0), (1, 1), (2, 2)]
+
+
+def test_a_network_that_goes_away_does_not_hold_up_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tracking, "_UPLOAD", 0.5)
+    recipe = METRPORecipe(wandb=WandbSettings(mode="online"))
+    said: list[str] = []
+    with ExitStack() as network:
+        server = network.enter_context(wandb_server())
+        monkeypatch.setenv("WANDB_BASE_URL", server.url)
+        monkeypatch.setenv("WANDB_API_KEY", 40 * "a")
+        wandb.teardown()
+        with trackers(recipe, tmp_path, {}, [], [], said.append) as (tracker,):
+            network.close()
+            tracker.log({"iteration": 0}, {"iteration": 1.0})
+    wandb.teardown()
+    (file,) = wandb_files(tmp_path)
+    assert said == [
+        "W&B: not everything has arrived within 0.5 s; send the rest with "
+        f"wandb sync {file.path.parent}"
+    ]
+    assert [row["iteration"] for row in file.history] == [0]
+
+
+@pytest.mark.skipif(not HAS_FORKS, reason="finds the process in /proc")
+@pytest.mark.filterwarnings("ignore:subprocess:ResourceWarning")  # of the processes killed
+def test_a_process_of_wandb_that_dies_costs_one_line(tmp_path: Path) -> None:
+    recipe = METRPORecipe(wandb=WandbSettings(mode="offline"))
+    said: list[str] = []
+    rows = [({"iteration": i}, {"iteration": 1.0}) for i in range(2)]
+    for name in ("end", "signal", "row", "next"):
+        (tmp_path / name).mkdir()
+    # Before the end, also on a signal, and before a row.
+    with trackers(recipe, tmp_path / "end", {}, [], [], said.append) as (tracker,):
+        tracker.log(*rows[0])
+        kill_wandb()
+    with (
+        pytest.raises(SystemExit, match="143"),
+        trackers(recipe, tmp_path / "signal", {}, [], [], said.append) as (tracker,),
+    ):
+        tracker.log(*rows[0])
+        kill_wandb()
+        raise SystemExit(143)
+    with trackers(recipe, tmp_path / "row", {}, [], [], said.append) as (tracker,):
+        kill_wandb()
+        for row in rows:
+            tracker.log(*row)
+    assert len(said) == 3
+    assert all(line.endswith("--resume logs what it lacks of the training") for line in said)
+    # The next run of the process, as in a sweep, has another one.
+    with trackers(recipe, tmp_path / "next", {}, [], [], said.append) as (tracker,):
+        tracker.log(*rows[0])
+    assert len(said) == 3 and len(wandb_files(tmp_path / "next")[0].history) == 1
+    gc.collect()
+
+
+def test_a_process_of_wandb_that_does_not_start_is_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(wandb, "init", Mock(side_effect=ConnectionResetError))
+    recipe = METRPORecipe(wandb=WandbSettings(mode="offline"))
+    with (
+        pytest.raises(RunDirectoryError, match="W&B: ConnectionResetError; use"),
+        trackers(recipe, tmp_path, {}, [], []),
+    ):
+        pass
+
+
+def kill_wandb() -> None:
+    """Kill W&B's own process, and wait until this one can notice."""
+    for pid in descendants(os.getpid()):
+        if Path(f"/proc/{pid}/comm").read_text().startswith("wandb-core"):
+            os.kill(pid, signal.SIGKILL)
+            while Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z":
+                time.sleep(0.01)
+
+
+def test_a_run_that_the_caller_logs_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    settings = wandb.Settings(silent=True, console="off")
+    with wandb.init(mode="offline", dir=str(tmp_path), settings=settings) as mine:
+        recipe = METRPORecipe(wandb=WandbSettings(mode="offline"))
+        with trackers(recipe, tmp_path / "run", {}, [], []) as (tracker,):
+            tracker.log({"iteration": 0}, {"iteration": 1.0})
+        assert wandb.run is mine
+        mine.log({"a": 1})
+    (file,) = wandb_files(tmp_path / "run")
+    assert [row["iteration"] for row in file.history] == [0]
 
 
 def test_kills_at_random_moments_lose_nothing(

@@ -150,9 +150,12 @@ def test_a_file_that_says_nothing_of_the_run_is_removed(content: bytes, tmp_path
     assert [path.parent for path in tmp_path.rglob("*.wandb")] == [good.parent]
 
 
-def test_files_are_put_together_by_the_time_of_their_start(tmp_path: Path) -> None:
-    written(tmp_path, [run_record(start=9), history(METRICS[1], 4), end_record()], number=0)
-    written(tmp_path, [run_record(start=8), history(METRICS[0], 0), end_record()], number=1)
+@pytest.mark.parametrize("starts", [(8, 9), (9, 8)], ids=["as begun", "a clock that is behind"])
+def test_files_are_put_together_by_their_steps(starts: tuple[int, int], tmp_path: Path) -> None:
+    first, second = map(run_record, starts)
+    written(tmp_path, [second, history(METRICS[1], 4), end_record()], number=0)
+    written(tmp_path, [first, history(METRICS[0], 0), end_record()], number=1)
+    written(tmp_path, [first, end_record()], number=2)
     held = take_over(tmp_path, METRICS, print)
     assert (list(held.rows), held.next_step) == ([0, 1], 5)
 

@@ -51,11 +51,11 @@ def main(arguments: Sequence[str]) -> None:
 def train(settings: Mapping[str, Any]) -> None:
     """Train or resume as planned by the campaign, even if the recipe has changed since.
 
-    Exits with the status ``TEMPORARY_FAILURE`` if another process is running in the run directory.
+    Exits with the status ``TAKEN`` if another process is running in the run directory.
     """
     from omegaconf import DictConfig, OmegaConf
 
-    from torchrl_l1.campaign.workers import TEMPORARY_FAILURE
+    from torchrl_l1.campaign.workers import TAKEN
     from torchrl_l1.experiment.errors import USER_ERRORS, RunDirectoryInUse, message
     from torchrl_l1.experiment.run import run
     from torchrl_l1.experiment.settings import schema_of
@@ -68,7 +68,7 @@ def train(settings: Mapping[str, Any]) -> None:
             run(config)
     except RunDirectoryInUse as error:
         print(error, file=sys.stderr)
-        sys.exit(TEMPORARY_FAILURE)
+        sys.exit(TAKEN)
     except USER_ERRORS as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise

@@ -15,9 +15,10 @@ from types import FrameType
 
 from torchrl_l1.experiment.errors import RunDirectoryError, message
 from torchrl_l1.experiment.files import refuse_link, write_atomically
+from torchrl_l1.experiment.shutdown import RESUME_ME
 
-# Status of a process whose work another one is doing; EX_TEMPFAIL, which Windows lacks.
-TEMPORARY_FAILURE = 75
+# Status of a process whose work another one is doing; EX_UNAVAILABLE, which Windows lacks.
+TAKEN = 69
 POLL_SECONDS = 0.1
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
 _STOPPING = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
@@ -102,8 +103,8 @@ class Stopped(Exception):
 class Workers:
     """Runs jobs, ``count`` at a time, in the calling thread.
 
-    A process that ends with the status ``TEMPORARY_FAILURE`` has found another one doing its work;
-    it is started again once that one has ended.
+    A process that ends with the status ``TAKEN`` has found another one doing its work; it is
+    started again once that one has ended.
 
     Each process has one thread and its own session, so that Ctrl-C reaches only the campaign,
     which then ends the processes. The calling thread must be the main one: on Linux, the system
@@ -193,8 +194,10 @@ class Workers:
             if status is None:
                 continue
             self._running.remove(entry)
-            if status == TEMPORARY_FAILURE:
+            if status == TAKEN:
                 self._queue.append(job)
+            elif status == RESUME_ME:
+                self._failures.append(Failure(job, "has made room, as it was asked"))
             elif status != 0:
                 how = f"signal {-status}" if status < 0 else f"status {status}"
                 self._failures.append(Failure(job, f"ended with {how}"))

@@ -116,10 +116,14 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _print_anything() -> None:
-    """Keep characters that the terminal's encoding lacks from ending a command.
+    """Keep closed streams and characters that the terminal's encoding lacks from ending a command.
 
-    They are escaped, as Python does on standard error.
+    What would go to a stream that a wrapper has closed is dropped. The characters are escaped, as
+    Python does on standard error.
     """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
     if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")
 

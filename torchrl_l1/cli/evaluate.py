@@ -269,6 +269,15 @@ def _plots(summary: Sequence[Mapping[str, Any]], run: TrainedRun, output: Path) 
     return [file for file in drawn if file is not None]
 
 
+def _check_results(output: Path) -> None:
+    """Refuse a folder that has files named like the results but no evaluation."""
+    for name in ("episodes.csv", "summary.csv", *_PICTURES):
+        if (output / name).exists() and not (output / "evaluation.csv").exists():
+            raise ValueError(
+                f"{output / name} already exists, and is of no evaluation: give another --output"
+            )
+
+
 def evaluate_command(options: argparse.Namespace) -> None:
     """``torchrl-l1 evaluate``: print a table and write CSV, PNG and, on request, a filmstrip."""
     values = {axis.name: getattr(options, axis.name) for axis in axes()}
@@ -294,6 +303,7 @@ def evaluate_command(options: argparse.Namespace) -> None:
     output = Path(options.output) if options.output else runs[0].path / folder
     if not options.output:
         refuse_link(output)
+    _check_results(output)
     make_folder(output)
     rows, episodes = [], []
     total = len(runs) * len(cells)

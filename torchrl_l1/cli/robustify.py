@@ -30,6 +30,7 @@ from torchrl_l1.experiment.tracking import (
     check_wandb_mode,
     chosen_mode,
     log_evaluation,
+    own_run,
 )
 from torchrl_l1.experiment.wandb_files import known_id
 
@@ -149,7 +150,7 @@ def robustify_command(options: argparse.Namespace) -> None:
     if options.wandb != "disabled":
         try:
             _log(options, table, chart, output)
-        except wandb.errors.Error as error:
+        except Exception as error:  # those of a W&B process that has died have no common class
             print(f"W&B: {message(error)}; all other results are written", file=sys.stderr)
 
 
@@ -223,7 +224,7 @@ def _log(options: argparse.Namespace, table: Assessment, chart: Path, output: Pa
         config=config,
         dir=str(output),
         name=f"robustify {options.env}",
-        settings=wandb.Settings(silent=True, console="off"),
+        settings=own_run(),
     ) as run:
         columns: list[str | int] = list(dict.fromkeys(key for row in table for key in row))
         rows = [[row.get(str(key)) for key in columns] for row in table]

@@ -9,7 +9,7 @@ from typing import Any
 
 from torchrl_l1.atomic import write_atomically
 from torchrl_l1.control import L1Config
-from torchrl_l1.deployment.policies import Policy
+from torchrl_l1.deployment.policies import Policy, is_run
 from torchrl_l1.deployment.policy_files import FILE_KINDS
 from torchrl_l1.envs import code_digests, file_digest
 from torchrl_l1.experiment.checkpoints import kept_by
@@ -150,9 +150,11 @@ def check_runs_nothing(folder: Path, stored: dict[str, Any]) -> None:
         ValueError: naming it.
     """
     _refuse_code(folder, [stored["environment"]])
-    data = [name for name, kind in FILE_KINDS.items() if not kind.is_code]
-    _refuse_code(folder, [stored["policy"]], data)
-    check_run_names_nothing(placed(stored["policy"], folder))
+    policy = placed(stored["policy"], folder)
+    if policy and not is_run(policy):
+        data = [name for name, kind in FILE_KINDS.items() if not kind.is_code]
+        _refuse_code(folder, [stored["policy"]], data)
+    check_run_names_nothing(policy)
 
 
 def check_run_names_nothing(policy: Policy | None) -> None:

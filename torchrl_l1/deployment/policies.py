@@ -305,6 +305,14 @@ def _short(error: Exception) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
+def is_run(source: str) -> bool:
+    """Whether a policy's name is that of a run or a kept checkpoint: these may have any path."""
+    kind, _, rest = source.partition(":")
+    path = Path(source)
+    of_run = path.is_dir() or (kept_by(path) is not None and path.is_file())
+    return of_run and not (kind in FILE_KINDS and rest)
+
+
 def _from_source(source: str, normalization: str | None, search_path: Sequence[str]) -> Any:
     kind, _, rest = source.partition(":")
     if kind in FILE_KINDS and rest:
@@ -316,7 +324,7 @@ def _from_source(source: str, normalization: str | None, search_path: Sequence[s
             raise
         except Exception as error:  # reading a foreign file may raise anything
             raise ValueError(f"{rest} cannot be read as {kind}: {_short(error)}") from error
-    if Path(source).is_dir() or (kept_by(Path(source)) and Path(source).is_file()):
+    if is_run(source):
         return list(load_run(source).algorithm.policies.values())[-1]
     if not rest:
         raise ValueError(f"unknown policy {source!r}; policies are {FORMS}")

@@ -54,7 +54,11 @@ USER_ERRORS = (
 )
 
 _SPACE = "free some space; nothing is lost, and the same command continues"
+_LOCKS = "this file system has no locks; choose another one, or have it mounted with flock"
 _REMEDIES = {
+    errno.ENOSYS: _LOCKS,
+    errno.ENOLCK: _LOCKS,
+    errno.EOPNOTSUPP: _LOCKS,
     errno.ENOSPC: _SPACE,
     errno.EDQUOT: _SPACE,
     errno.EROFS: "choose a place that can be written to",
@@ -90,7 +94,7 @@ def message(error: BaseException) -> str:
         text = _of_hydra(text, str(cause) if isinstance(cause, OmegaConfBaseException) else "")
     elif isinstance(error, OmegaConfBaseException):
         text = _of_hydra(text, "")
-    line = " ".join(text.split())
+    line = " ".join(text.split()) or type(error).__name__
     return line if len(line) <= _LONGEST else line[:_LONGEST] + " ..."
 
 

@@ -114,7 +114,7 @@ def make_folder(folder: Path) -> None:
     probe = folder / ".writable"
     try:
         write_atomically(probe, "")
-        probe.unlink()
+        probe.unlink(missing_ok=True)  # another process may have done so
     except OSError as error:
         raise type(error)(error.errno, error.strerror, str(folder)) from error
 
@@ -146,6 +146,7 @@ def locked(file: Path, mode: str = "a") -> Iterator[bool]:
 
     Raises:
         RunDirectoryError: if the file is a link or not a regular file.
+        OSError: with the name of the file, also where the file system has no locks.
     """
     refuse_link(file)
     if file.exists() and not file.is_file():
@@ -155,7 +156,10 @@ def locked(file: Path, mode: str = "a") -> Iterator[bool]:
         return os.open(path, flags | NO_FOLLOW, 0o666)
 
     with open(file, mode, encoding="utf-8", opener=opener) as handle:
-        ours = lock_descriptor(handle.fileno(), blocking=False)
+        try:
+            ours = lock_descriptor(handle.fileno(), blocking=False)
+        except OSError as error:
+            raise type(error)(error.errno, error.strerror, str(file)) from error
         try:
             yield ours
         finally:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import fields
 from pathlib import Path
@@ -331,8 +331,12 @@ def _search_path_override(recipe: Path, config: DictConfig, overrides: Sequence[
     if config.get("search_path"):
         return []
     folders = _folders_of_code(recipe, config, overrides)
-    quoted = ",".join("'" + folder.replace("'", "\\'") + "'" for folder in folders)
-    return [f"search_path=[{quoted}]"] if folders else []
+    return [f"search_path=[{_quoted(folders)}]"] if folders else []
+
+
+def _quoted(texts: Iterable[str]) -> str:
+    """Texts as the elements of a list in Hydra's grammar."""
+    return ",".join("'" + text.replace("'", "\\'") + "'" for text in texts)
 
 
 def _folders_of_code(recipe: Path, config: DictConfig, overrides: Sequence[str]) -> list[str]:
@@ -356,8 +360,7 @@ def _search_path(recipe: Path) -> list[str]:
                 "rename the file"
             )
     unique = dict.fromkeys(folder for folder in folders if folder != recipe.parent)
-    quoted = ",".join(f"'file://{folder}'" for folder in unique)
-    return [f"hydra.searchpath=[{quoted}]"]
+    return [f"hydra.searchpath=[{_quoted(f'file://{folder}' for folder in unique)}]"]
 
 
 def _check_options(recipe: Path, overrides: Sequence[str]) -> None:

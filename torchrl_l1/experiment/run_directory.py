@@ -14,6 +14,7 @@ import torch
 import yaml  # type: ignore[import-untyped]
 from omegaconf import OmegaConf
 
+from torchrl_l1.atomic import TEMPORARY
 from torchrl_l1.experiment.checkpoints import read_checkpoint
 from torchrl_l1.experiment.errors import RunDirectoryError, RunDirectoryInUse, message
 from torchrl_l1.experiment.files import (
@@ -34,8 +35,12 @@ from torchrl_l1.experiment.provenance import (
     versions,
 )
 
-# Files that a run killed in its first moments may leave; its directory is still free.
-_BEFORE_CONFIG = (".lock", "versions.json", "versions.json.tmp", "config.yaml.tmp")
+# Files that a run killed in its first moments, a file manager and NFS may leave; the directory is
+# still free.
+_BEFORE_CONFIG = (
+    *(".lock", "versions.json", "versions.json.tmp", "config.yaml.tmp", TEMPORARY),
+    *(".DS_Store", ".nfs*"),
+)
 
 # Settings that may change when a run continues and that matter to its later use.
 _RENEWED = (MAY_GROW, "search_path")
@@ -104,6 +109,8 @@ class RunDirectory:
         with locked(self.path / ".lock") as ours:
             if not ours:
                 raise RunDirectoryInUse(f"another process is running in {self.path}")
+            for left in self.path.glob(TEMPORARY):  # by a kill
+                left.unlink()
             if not self.config_file.exists():
                 found = {**versions(), **code_versions(config), **data_version(config)}
                 write_atomically(self.versions_file, json.dumps(found, indent=2))
@@ -120,7 +127,9 @@ class RunDirectory:
         """Whether a run may begin here: there is nothing but remains of one killed at once."""
         if not self.path.exists():
             return True
-        return self.path.is_dir() and all(f.name in _BEFORE_CONFIG for f in self.path.iterdir())
+        return self.path.is_dir() and all(
+            any(map(file.match, _BEFORE_CONFIG)) for file in self.path.iterdir()
+        )
 
     def held(self) -> bool:
         """Whether a process is running in this directory."""

@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 RESUME_ME = 75
@@ -68,8 +68,12 @@ def orderly_end() -> Iterator[None]:
 
 
 def _say(line: str) -> None:
-    if sys.stderr is sys.__stderr__:
-        # The signal may have come while something else was being written through it.
-        os.write(2, f"{line}\n".encode())
-    else:
-        print(line, file=sys.stderr)
+    if sys.stderr is None:
+        return
+    # A full disk or a closed terminal costs the line, not the orderly end.
+    with suppress(OSError, ValueError):
+        if sys.stderr is sys.__stderr__:
+            # The signal may have come while something else was being written through it.
+            os.write(2, f"{line}\n".encode())
+        else:
+            print(line, file=sys.stderr)

@@ -8,11 +8,12 @@ from __future__ import annotations
 import csv
 import os
 import secrets
+import shlex
 import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -40,12 +41,15 @@ Row = Mapping[str, Any]
 
 _PATIENCE = 10.0
 
+# Seconds for what has not been uploaded when a run ends; W&B's own default is to wait for ever.
+_UPLOAD = 60.0
+
 
 def check_wandb_mode(mode: str) -> None:
     """Make sure that W&B can be used in a mode.
 
     Raises:
-        ValueError: for an unknown mode, or one that needs a missing API key.
+        ValueError: for an unknown mode, or one that needs a missing API key or home folder.
     """
     if mode not in MODES:
         raise ValueError(f"wandb.mode must be one of {', '.join(MODES)}, got {mode!r}")
@@ -55,6 +59,11 @@ def check_wandb_mode(mode: str) -> None:
             f"WANDB_MODE={here}: it must be one of {', '.join(_WANDB_MODES)}; or set wandb.mode"
         )
     setting, asked = ("WANDB_MODE", here) if mode == "auto" else ("wandb.mode", mode)
+    if asked != "disabled":
+        try:
+            Path.home()  # as in containers with the number of a user that they do not know
+        except RuntimeError as error:
+            raise ValueError("W&B needs a home folder: set HOME, or wandb.mode=disabled") from error
     if asked in _ONLINE and not _has_key():
         raise ValueError(
             f"{setting}={asked} needs an API key; log in with wandb login or set WANDB_API_KEY, or "
@@ -112,6 +121,20 @@ def _logged_in() -> bool:
     except wandb.errors.Error:
         # A key but no network to verify it: nothing is lost offline.
         return False
+
+
+def own_run() -> wandb.Settings:
+    """W&B's settings for a run that says nothing, ends in any case, and leaves other runs alone."""
+    return wandb.Settings(
+        silent=True,
+        console="off",
+        # Without it, a run that the calling program has open would be logged to and ended.
+        reinit="create_new",
+        finish_timeout=_UPLOAD,
+        finish_timeout_raises=True,
+        # Without the suffix, two within a second would share a folder.
+        x_sync_dir_suffix=secrets.token_hex(3),
+    )
 
 
 @dataclass
@@ -202,12 +225,10 @@ class WandbTracker(Tracker):
                 dir=str(run_dir),
                 id=held.run,
                 resume="allow",
-                # Without the suffix, two within a second would share a folder.
-                settings=wandb.Settings(
-                    silent=True, console="off", x_sync_dir_suffix=secrets.token_hex(3)
-                ),
+                settings=own_run(),
             )
-        except wandb.errors.Error as error:
+        # The errors of a W&B process that has died have no common class.
+        except Exception as error:
             raise RunDirectoryError(
                 f"W&B: {message(error)}; use wandb.mode=offline to run without it"
             ) from error
@@ -236,12 +257,14 @@ class WandbTracker(Tracker):
         try:
             # Uncommitted data wait in memory for the next step and are lost in a kill.
             self._run.log(_values(metrics, timing), step=step, commit=True)
-        # The errors of a W&B process that has died have no common class.
         except Exception as error:
-            if not self._failed:
-                self._say(f"W&B: {message(error) or type(error).__name__}; --resume logs the rest")
-            self._failed = True
+            self._fail(error)
         self._next_step = step + 1
+
+    def _fail(self, error: Exception) -> None:
+        if not self._failed:
+            self._say(f"W&B: {message(error)}; --resume logs what it lacks of the training")
+        self._failed = True
 
     def evaluation(self, evaluated: Evaluated) -> None:
         """Log a table, charts and films under the evaluation's name."""
@@ -258,9 +281,21 @@ class WandbTracker(Tracker):
     def close(self, status: int = 0) -> None:
         """Flush and close."""
         file = Path(self._run.settings.sync_file)
-        if self._failed:
+        try:
+            if not self._failed:
+                self._run.finish(exit_code=status)
+        except TimeoutError:
+            self._say(
+                f"W&B: not everything has arrived within {_UPLOAD:g} s; send the rest with "
+                f"wandb sync {shlex.quote(str(file.parent))}"
+            )
             return
-        self._run.finish(exit_code=status)
+        except Exception as error:
+            self._fail(error)
+        if self._failed:
+            with suppress(Exception):
+                wandb.teardown()  # or the next run of this process would ask the same dead one
+            return
         # W&B's own process may write the last records slightly later.
         deadline = time.monotonic() + _PATIENCE
         while file.is_file() and not has_ended(file) and time.monotonic() < deadline:
@@ -422,8 +457,9 @@ def log_evaluation(
                 return
             # Missing rows of the training come first.
             metrics, timings = (_rows(run_dir / f"{name}.csv") for name in ("metrics", "timing"))
+            timings = timings[: len(metrics)]  # written first: a kill may leave one more
             with trackers(now, run_dir, config, metrics, timings, say) as opened:
                 for tracker in opened:
                     tracker.evaluation(evaluated)
-    except (OSError, ValueError, RunDirectoryError, wandb.errors.Error) as error:
+    except Exception as error:
         say(f"{run_dir}: {evaluated.name} is not logged: {message(error)}")

@@ -184,7 +184,7 @@ def take_over(
             shutil.rmtree(path.parent, ignore_errors=True)
         else:
             files.append(file)
-    files.sort(key=lambda file: file.start or 0.0)
+    files.sort(key=_order)
     held = Held(run)
     if not _collect(files, metrics, held):
         for file in files:
@@ -203,6 +203,12 @@ def take_over(
             # An end written meanwhile is cut off: no history follows it.
             write_atomically(file.path, content[: file.end])
     return held
+
+
+def _order(file: WandbFile) -> tuple[float, float]:
+    """By their steps, which never decrease; clocks of two machines may differ."""
+    first = file.history[0]["_step"] if file.history else math.inf
+    return first, file.start or 0.0
 
 
 def _collect(files: Sequence[WandbFile], metrics: Sequence[Mapping[str, Any]], held: Held) -> bool:
