@@ -497,3 +497,20 @@ def test_a_model_that_nobody_has_calibrated_is_told_of_once(settings, warned):
             env.rollout(2)
         told = ["call calibrate_filter(" in str(each.message) for each in found]
         assert told == [True] * expected
+
+
+@pytest.mark.parametrize("law", [L1Config, L1Config.robust])
+def test_effects_that_are_lost_in_rounding_are_told_of_once(law):
+    x, u = 1e-11 * torch.randn(5, 3), torch.randn(5, 2)
+    config = law(0.05, action_low=-1.0, action_high=1.0)
+    for unit, rows, told in ((1.0, 5, [0, 1]), (1e9, 5, []), (1.0, 1, [0, 1]), (1e9, 1, [])):
+        gain = unit * 5e-11 * torch.tensor([[1.0, 0.5, 0.0], [0.0, 1.0, 0.5]])
+        dynamics = WithCovariance(lambda x: torch.eye(3))
+        dynamics.mean_change = lambda x, u, gain=gain: u @ gain
+        step = make_step(config, ActionJacobian(dynamics), False)
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            for _ in range(2):
+                step(init([rows], 3, 2, config), unit * x[:rows], u[:rows])
+        lost = [f"actions {told} is lost in rounding" in str(each.message) for each in found]
+        assert lost == [True] * bool(told)

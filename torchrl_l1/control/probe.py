@@ -15,6 +15,9 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from torchrl_l1.control.least_squares import without_effect
+from torchrl_l1.control.signals import wide
+
 Mode = Literal["analytic", "forward", "reverse"]
 ChangeFunction = Callable[[Tensor, Tensor], Tensor]
 JacobianFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -172,6 +175,30 @@ def warn_of_residuals(dynamics: object, *, is_calibrated: bool) -> None:
             "since they are not calibrated: after the fit, call "
             "calibrate_filter(model.residuals, model.value_and_jacobian, data, config) with "
             "episodes of at least 20 steps, or give inflation",
+            stacklevel=2,
+        )
+
+
+@torch.no_grad()
+def warn_of_small_effects(
+    dynamics: object, jacobian: Tensor, observation: Tensor, reach: Tensor | float
+) -> None:
+    """Warn of actions whose effect at a first step is there, but too small to be acted on.
+
+    Args:
+        dynamics: the model, to be named in the warning.
+        jacobian: ``(..., n, m)``.
+        observation: ``(..., n)``.
+        reach: half the range of each action ``(m,)``, or a number.
+    """
+    jacobian, size = wide(jacobian), wide(observation).abs()
+    small = without_effect(jacobian, size, reach) & (jacobian != 0).any(-2)
+    entries = small.reshape(-1, small.shape[-1]).all(0).nonzero().flatten().tolist()
+    if entries:
+        warnings.warn(
+            f"at the first step of {describe(dynamics)} the effect of the actions {entries} is lost "
+            "in rounding, and L1 leaves them alone: if states are small numbers, as positions of "
+            "micrometres in metres, give the model and L1 smaller units",
             stacklevel=2,
         )
 
