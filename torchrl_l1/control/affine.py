@@ -19,6 +19,7 @@ from torchrl_l1.control.probe import (
     FORWARD_MODE,
     probe_covariance,
     warn_of_residuals,
+    warn_of_shared_effects,
     warn_of_small_effects,
 )
 from torchrl_l1.control.signals import (
@@ -383,6 +384,10 @@ def _prepared(step: StepFunction, config: L1Config, model: ActionJacobian) -> St
                 )
                 is_calibrated = not config.needs_calibration or config.inflation is not None
                 warn_of_residuals(model.dynamics, is_calibrated=is_calibrated)
+            if config.needs_calibration:
+                _, jacobian = model.value_and_jacobian(observation, action)
+                known = model.residual_statistics(observation, action, config.covariance)
+                warn_of_shared_effects(model.dynamics, jacobian, known.covariance)
             is_checked = True
             return step(state, observation, u_rl)
 

@@ -31,7 +31,7 @@ def seal_width(observation_dim: int, action_dim: int, has_memory: bool) -> int:
 
 
 def sealed(observation: Tensor, state: L1State) -> Tensor:
-    """A copy of observation and state in the type of the filter's state, which the caller may modify in place.
+    """A copy of observation and state in one type, which the caller may modify in place.
 
     Wide entries that only some laws remember are represented by their sum.
     """
