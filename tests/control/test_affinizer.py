@@ -49,6 +49,19 @@ def test_operating_point_is_remembered_until_the_tolerance_is_exceeded():
     torch.testing.assert_close(out["affine", "jacobian"][:, 0, 0], torch.tensor([0.0, 2.0]))
 
 
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
+def test_a_first_action_that_is_not_finite_is_no_operating_point(wrong):
+    affinizer = Affinizer(change, epsilon=0.5, action_dim=1)
+    memory = affinizer.make_primer().primers["affine"].zero()
+    gains = []
+    for action in (wrong, 0.5, 0.5):
+        data = TensorDict(observation=torch.zeros(3), action=torch.tensor([action]), affine=memory)
+        out = affinizer(data)
+        memory = out["next", "affine"]
+        gains.append(out["affine", "jacobian"][0, 0].item())
+    assert gains[1:] == [1.0, 1.0] and memory["started"].item()
+
+
 def test_memory_lives_in_the_environment():
     model = EnsembleDynamics(3, 1, members=2, hidden=(8,))
     affinizer = Affinizer(model, epsilon=1e6)

@@ -33,7 +33,7 @@ def test_a_replay_is_the_regression_of_all_residuals_so_far():
     )
     statistics = ResidualStatistics(torch.diag(deviation.square()))
     action = residual.new_zeros(sequences, steps, m)
-    mean, variance = replay(config, residual, jacobian, action, statistics)
+    _, mean, variance = replay(config, residual, jacobian, action, statistics)
     precision = torch.diag(1 / (2 * deviation.square()))
     # Ridge regression on the first k residuals, whose penalty is the prior's.
     for k in (1, 7, steps):
@@ -96,6 +96,25 @@ def test_candidates_do_not_mix():
             process_noises=[row["process_noise"]],
         )
         assert alone.table[0] == pytest.approx(row, rel=1e-4)
+
+
+def test_the_table_counts_what_the_record_of_forecasts_takes_off_the_input():
+    # A push that turns every fifteen steps: many forecasts have the wrong sign.
+    push = 0.6 * (2.0 * (torch.arange(60).reshape(-1, 1) // 15 % 2) - 1)
+    residual = push + 0.1 * autocorrelated(4, 60, 1, 0.0)
+    recorded, whole = (
+        calibrate(
+            L1Config.robust(0.02, skill_forgetting=forgetting, **BOUNDS),
+            residual,
+            torch.ones(4, 60, 1, 1),
+            0.01 * torch.eye(1),
+            inflations=[1.0],
+        ).table
+        for forgetting in (0.99, 1.0)
+    )
+    for one, other in zip(recorded, whole, strict=True):
+        assert one["consistency"] == pytest.approx(other["consistency"])
+        assert one["error"] < 0.98 * other["error"]
 
 
 @pytest.mark.parametrize(
@@ -175,7 +194,7 @@ def test_a_replay_knows_what_was_executed():
     action = torch.tensor([[1.0] * 5, [-1.0] * 5, [0.0, 0.0, 1.0, 1.0, 1.0]]).unsqueeze(-1)
     push = 0.5 * torch.tensor([[0.3] * 5, [0.3] * 5, [0.3, 0.3, 0.0, 0.0, 0.0]]).unsqueeze(-1)
     statistics = ResidualStatistics(1e-8 * torch.eye(1))
-    mean, variance = replay(config, push, torch.full((3, 5, 1, 1), 0.5), action, statistics)
+    _, mean, variance = replay(config, push, torch.full((3, 5, 1, 1), 0.5), action, statistics)
     assert not mean[0, 0].any()
     walked = 0.5**2 + 0.1**2 * torch.arange(1.0, 6.0)
     torch.testing.assert_close(variance[0, 0, :, 0], walked)

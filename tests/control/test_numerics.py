@@ -9,7 +9,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchrl_l1.control import ActionJacobian, L1Config, augment, init, step
+from torchrl_l1.control import (
+    ActionJacobian,
+    L1Config,
+    ResidualStatistics,
+    augment,
+    init,
+    step,
+)
 from torchrl_l1.control.least_squares import solve_matched, without_effect
 
 DTYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
@@ -73,10 +80,12 @@ def test_any_numbers_leave_the_action_finite_bounded_and_in_its_row(
             assert (
                 u.abs() <= torch.tensor(bound, dtype=torch.float64).clamp(max=limit).to(dtype)
             ).all()
+            assert state.x_hat.dtype == state.u_bar.dtype == dtype
             for name, value in (*state.entries().items(), *signals._asdict().items()):
                 assert value.isfinite().all(), name
-                if value.is_floating_point():
-                    assert value.dtype == dtype, name
+                if value.is_floating_point() and name not in ("x_hat", "u_bar"):
+                    precise = torch.promote_types(dtype, torch.float32)
+                    assert value.dtype == (precise if name in state.entries() else dtype), name
             found.append((u, *state.entries().values(), *signals))
         runs.append(found)
     for before, after in zip(*runs, strict=True):
@@ -256,6 +265,39 @@ def test_a_bias_is_cancelled_in_half_precision(dtype, law):
     if law == "low_pass":
         assert ((u + bias).abs() < 0.05).all()
     assert u.isfinite().all()
+
+
+@pytest.mark.parametrize("dtype", HALF)
+@pytest.mark.parametrize(
+    "config",
+    [
+        L1Config(0.05, alpha=0.01, a_s=-1e-3, action_low=-1.0, action_high=1.0),
+        L1Config.robust(0.05, process_noise=0.001, action_low=-1.0, action_high=1.0),
+    ],
+)
+def test_what_accumulates_in_small_steps_does_not_stall_in_half_precision(config, dtype):
+    last = {}
+    for kind in (dtype, torch.float32):
+        state, x = init([1], 1, 1, config, dtype=kind), torch.zeros(1, 1, dtype=kind)
+        u_rl, jacobian = torch.zeros(1, 1, dtype=kind), torch.ones(1, 1, 1, dtype=kind)
+        residuals = ResidualStatistics(0.01 * torch.eye(1, dtype=kind))
+        for _ in range(500):
+            u, state, _ = step(config, state, x, u_rl, -x, jacobian, residuals=residuals)
+            x = (u.float() + 0.3).to(kind)
+        last[kind] = u.item()
+    assert last[dtype] == pytest.approx(last[torch.float32], abs=2e-3)
+    assert last[torch.float32] == pytest.approx(-0.3, abs=0.01)
+
+
+def test_the_record_of_forecasts_is_forgotten_in_half_precision():
+    config = L1Config.robust(0.05, skill_forgetting=0.999, action_low=-1.0, action_high=1.0)
+    zero = torch.zeros(1, 1, dtype=torch.bfloat16)
+    state = init([1], 1, 1, config, dtype=zero.dtype)
+    _, state, _ = step(config, state, zero, zero, zero, zero.unsqueeze(-1))
+    state = state._replace(skill=torch.full_like(state.skill, 100.0))
+    for _ in range(300):
+        _, state, _ = step(config, state, zero, zero, zero, zero.unsqueeze(-1))
+    assert state.skill.flatten().tolist() == pytest.approx([100 * 0.999**300] * 2, rel=1e-4)
 
 
 @pytest.mark.parametrize(

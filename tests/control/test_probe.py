@@ -497,3 +497,44 @@ def test_a_model_that_nobody_has_calibrated_is_told_of_once(settings, warned):
             env.rollout(2)
         told = ["call calibrate_filter(" in str(each.message) for each in found]
         assert told == [True] * expected
+
+
+@pytest.mark.parametrize("law", [L1Config, L1Config.robust])
+def test_effects_that_are_lost_in_rounding_are_told_of_once(law):
+    x, u = 1e-11 * torch.randn(5, 3), torch.randn(5, 2)
+    config = law(0.05, action_low=-1.0, action_high=1.0)
+    for unit, rows, told in ((1.0, 5, [0, 1]), (1e9, 5, []), (1.0, 1, [0, 1]), (1e9, 1, [])):
+        gain = unit * 5e-11 * torch.tensor([[1.0, 0.5, 0.0], [0.0, 1.0, 0.5]])
+        dynamics = WithCovariance(lambda x: torch.eye(3))
+        dynamics.mean_change = lambda x, u, gain=gain: u @ gain
+        step = make_step(config, ActionJacobian(dynamics), False)
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            for _ in range(2):
+                step(init([rows], 3, 2, config), unit * x[:rows], u[:rows])
+        lost = [f"actions {told} is lost in rounding" in str(each.message) for each in found]
+        assert lost == [True] * bool(told)
+
+
+@pytest.mark.parametrize(
+    ("gain", "told"),
+    [
+        ([[1.0, 0.5, 0.3], [2.0, 1.0, 0.6]], [0, 1]),  # the same, but for its size
+        ([[1.0, 0.5, 0.3], [1.0, 0.51, 0.3]], [0, 1]),  # nearly
+        ([[1.0, 0.5, 0.3], [0.0, 0.0, 0.0]], []),
+        ([[1.0, 0.5, 0.3], [1.0, -0.5, 0.3], [2.0, 1.0, 0.6]], [0, 2]),
+        ([[1.0, 0.5, 0.3], [1.0, -0.5, 0.3], [0.0, 0.0, 1.0]], []),
+        ([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]], [0, 1, 2]),
+    ],
+)
+def test_actions_whose_effects_cannot_be_told_apart_are_named(gain, told):
+    gain = torch.tensor(gain)
+    config = L1Config.robust(0.05, action_low=-1.0, action_high=1.0)
+    dynamics = WithCovariance(lambda x: 0.01 * torch.eye(3))
+    dynamics.mean_change = lambda x, u: u @ gain
+    step = make_step(config, ActionJacobian(dynamics), False)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        step(init([2], 3, len(gain), config), torch.randn(2, 3), torch.randn(2, len(gain)))
+    named = [f"actions {told} cannot be told apart" in str(each.message) for each in found]
+    assert named == [True] * bool(told)

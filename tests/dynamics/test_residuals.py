@@ -63,6 +63,42 @@ def test_correlations_of_few_residuals_are_shrunk_as_schaefer_and_strimmer_do():
     np.testing.assert_allclose(shrunk_covariance(torch.as_tensor(rows)), expected)
 
 
+def test_the_covariance_does_not_depend_on_the_units_of_the_states():
+    generator = torch.Generator().manual_seed(0)
+    rows = 0.1 * torch.randn(1000, 4, generator=generator)
+    change = torch.randn(1000, 4, generator=generator)
+    rows[:, 3] = 0.0  # known exactly
+    units = torch.tensor([1e3, 1e3, 1e-3, 1e-4])
+    expected = shrunk_covariance(rows, change)
+    np.testing.assert_allclose(expected.diag(), [0.01, 0.01, 0.01, 1e-6], rtol=0.15)
+    found = shrunk_covariance(rows * units, change * units)
+    torch.testing.assert_close(found / torch.outer(units, units), expected)
+    # A state that stays as it is has no unit of its own.
+    change[:, 3] = 0.0
+    assert shrunk_covariance(rows, change)[3, 3].item() == pytest.approx(1e-8, rel=0.15)
+
+
+def test_fits_and_calibrations_measure_small_units_as_well_as_large_ones():
+    units = torch.tensor([1e3, 1e3, 1e-2])
+    data = episodes([20] * 8)
+    seen, following = data["observation"] * units, data["next", "observation"] * units
+    data["observation"], data["next", "observation"] = seen, following
+
+    def in_units(observation, action):
+        change, jacobian = known(observation, action)
+        return change * units, jacobian * units.unsqueeze(-1)
+
+    residuals = Residuals(3)
+    config = L1Config.robust(0.05, action_low=-1.0, action_high=1.0)
+    calibrate_filter(residuals, in_units, data, config)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "the model is too poor")
+        model = fit_dynamics(data, hidden=(8,), members=2, max_epochs=2, batch_size=64)
+    change = (following - seen).square().mean(0)
+    for measured in (residuals, model.residuals):
+        assert (measured.covariance.diag() < 3 * change).all()
+
+
 def test_a_constant_error_counts():
     assert shrunk_covariance(torch.full((10, 1), 2.0)).item() == pytest.approx(4.0)
 

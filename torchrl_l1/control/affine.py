@@ -15,10 +15,17 @@ from torchrl_l1.compilation import CompileMode, compiled
 from torchrl_l1.control import kalman_law, law
 from torchrl_l1.control.config import Filter, L1Config
 from torchrl_l1.control.jacobian import ActionJacobian
-from torchrl_l1.control.probe import FORWARD_MODE, probe_covariance, warn_of_residuals
+from torchrl_l1.control.probe import (
+    FORWARD_MODE,
+    probe_covariance,
+    warn_of_residuals,
+    warn_of_shared_effects,
+    warn_of_small_effects,
+)
 from torchrl_l1.control.signals import (
     ControlInput,
     diagnose,
+    like,
     narrow,
     saturate,
     wide,
@@ -360,7 +367,12 @@ def _prepared(step: StepFunction, config: L1Config, model: ActionJacobian) -> St
             return step(state, observation, u_rl)
         with FORWARD_MODE:  # where the step is compiled, torch differentiates while it traces
             action = saturate(config, u_rl)
+            is_known = model.ready
             model.prepare(observation, action)
+            if not is_known:
+                _, jacobian = model.value_and_jacobian(observation, action)
+                reach = like(jacobian, config.half_range)
+                warn_of_small_effects(model.dynamics, jacobian, observation, reach)
             if config.needs_covariance:
                 probe_covariance(
                     model.dynamics,
@@ -372,6 +384,10 @@ def _prepared(step: StepFunction, config: L1Config, model: ActionJacobian) -> St
                 )
                 is_calibrated = not config.needs_calibration or config.inflation is not None
                 warn_of_residuals(model.dynamics, is_calibrated=is_calibrated)
+            if config.needs_calibration:
+                _, jacobian = model.value_and_jacobian(observation, action)
+                known = model.residual_statistics(observation, action, config.covariance)
+                warn_of_shared_effects(model.dynamics, jacobian, known.covariance)
             is_checked = True
             return step(state, observation, u_rl)
 

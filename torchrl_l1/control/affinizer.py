@@ -17,6 +17,7 @@ from torchrl_l1.control.layout import (
     declared_dimension,
     required_entry,
 )
+from torchrl_l1.control.least_squares import is_finite
 from torchrl_l1.control.module_model import Predicts
 
 _STATE = ("u_bar", "started")
@@ -120,7 +121,7 @@ class Affinizer(TensorDictModuleBase):
             tensordict.set((self.key, "error"), torch.where(started, error, 0.0))
             following = TensorDict(
                 u_bar=affinization.u_bar,
-                started=torch.ones_like(started),
+                started=is_finite(affinization.u_bar),
                 batch_size=tensordict.batch_size,
                 device=tensordict.device,
             )

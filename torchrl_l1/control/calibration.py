@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchrl_l1.control import kalman, kalman_law
+from torchrl_l1.control import kalman_law
 from torchrl_l1.control.config import L1Config
 from torchrl_l1.control.probe import is_positive
 from torchrl_l1.control.signals import saturate
@@ -122,9 +122,8 @@ def calibrate(
     )
     # The covariance is given here, wherever it comes from: none needs to be remembered.
     free = replace(config, process_noise=None, inflation=None, covariance="residuals")
-    mean, variance = replay(free, residual, jacobian, action, statistics, len(tried))
-    posterior = kalman.Posterior(mean, torch.diag_embed(variance))
-    left = (kalman.significant(posterior, config.dead_zone) - disturbance) / half_range
+    q, mean, variance = replay(free, residual, jacobian, action, statistics, len(tried))
+    left = (q - disturbance) / half_range
     error = left.square().mean((1, 2, 3)).sqrt()
     square = (mean.square() / variance)[:, :sequences, _SETTLED:].mean((1, 2, 3))
     table = [
@@ -194,7 +193,7 @@ def replay(
     action: Tensor,
     statistics: ResidualStatistics,
     candidates: int = 1,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Run the Kalman filter over recorded residuals, without acting on its estimates.
 
     Args:
@@ -208,7 +207,8 @@ def replay(
         candidates: C.
 
     Returns:
-        posterior mean and variance after each step ``(C, S, T, m)``.
+        after each step what the input would subtract, and the posterior's mean and variance
+        ``(C, S, T, m)`` each.
     """
     sequences, steps, n, m = jacobian.shape
     state = init(
@@ -223,13 +223,14 @@ def replay(
 
     # The first step only starts the filter, which knows nothing yet.
     estimated = kalman_law.estimate(config, state, zero, known(0))
-    means, variances = [], []
+    inputs, means, variances = [], [], []
     for t in range(steps):
         state = _before(config, state, estimated, jacobian[:, t], action[:, t])
         estimated = kalman_law.estimate(config, state, residual[:, t].expand_as(zero), known(t))
+        inputs.append(kalman_law.adapted(config, estimated, state.u_bar).q)
         means.append(estimated.posterior.mean)
         variances.append(estimated.posterior.covariance.diagonal(dim1=-2, dim2=-1))
-    return torch.stack(means, -2), torch.stack(variances, -2)
+    return torch.stack(inputs, -2), torch.stack(means, -2), torch.stack(variances, -2)
 
 
 def _before(

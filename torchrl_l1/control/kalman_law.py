@@ -17,7 +17,7 @@ from torchrl_l1.control.signals import (
     credible,
     like,
     narrow,
-    narrow_entries,
+    narrow_state,
     project,
     saturate,
     wide,
@@ -313,7 +313,7 @@ def follow(
         estimated.skill,
     )
     u = torch.where(finite, narrow(u, policy.dtype), policy)
-    return u, narrow_entries(following, dtype), terms
+    return u, narrow_state(following, dtype), terms
 
 
 class _Memory(NamedTuple):
@@ -361,7 +361,7 @@ def _remembered(
         return None
     residuals = _unit(observation) if residuals is None else residuals
     shape = state.residual_covariance.shape
-    return residuals.covariance.flatten(-2).expand(shape).masked_fill(non_finite, 0.0)
+    return wide(residuals.covariance).flatten(-2).expand(shape).masked_fill(non_finite, 0.0)
 
 
 def _unit(observation: Tensor) -> ResidualStatistics:

@@ -15,7 +15,7 @@ from torchrl_l1.control.signals import (
     diagnose,
     like,
     narrow,
-    narrow_entries,
+    narrow_state,
     project,
     saturate,
     wide,
@@ -222,7 +222,7 @@ def respond(
     )
     terms = Terms(x_err, estimate, effect_matched, control, ill_conditioned, non_finite, dtype)
     u = torch.where(finite, narrow(u, policy.dtype), policy)
-    return u, narrow_entries(following, dtype), terms
+    return u, narrow_state(following, dtype), terms
 
 
 def _effects(jacobian: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:

@@ -101,7 +101,7 @@ class Layout:
         state = init([], self.observation_dim, self.action_dim, config, dtype=self.dtype)
         entries = {name: (value.shape[-1], value.dtype) for name, value in state.entries().items()}
         width = seal_width(self.observation_dim, self.action_dim, bool(state.memory()))
-        entries[SEAL] = (width, self.dtype)
+        entries[SEAL] = (width, state.q.dtype)
         return self._composite(entries)
 
     def signal_spec(self, diagnostics: bool = True) -> Composite:

@@ -15,6 +15,9 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from torchrl_l1.control.least_squares import whitened, without_effect
+from torchrl_l1.control.signals import wide
+
 Mode = Literal["analytic", "forward", "reverse"]
 ChangeFunction = Callable[[Tensor, Tensor], Tensor]
 JacobianFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -22,6 +25,7 @@ JacobianFunction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 MOST_ROWS = 256
 """Of larger batches, only these first rows are checked."""
 
+_PARALLEL = 1e-3  # Squared; that of effects of two actions that are 2.5 degrees apart.
 _LARGEST = 1e6  # Larger values are skipped: their squares may overflow in an honest model.
 
 _RANDOM = (nn.modules.dropout._DropoutNd, nn.RReLU)
@@ -172,6 +176,58 @@ def warn_of_residuals(dynamics: object, *, is_calibrated: bool) -> None:
             "since they are not calibrated: after the fit, call "
             "calibrate_filter(model.residuals, model.value_and_jacobian, data, config) with "
             "episodes of at least 20 steps, or give inflation",
+            stacklevel=2,
+        )
+
+
+@torch.no_grad()
+def warn_of_small_effects(
+    dynamics: object, jacobian: Tensor, observation: Tensor, reach: Tensor | float
+) -> None:
+    """Warn of actions whose effect at a first step is there, but too small to be acted on.
+
+    Args:
+        dynamics: the model, to be named in the warning.
+        jacobian: ``(..., n, m)``.
+        observation: ``(..., n)``.
+        reach: half the range of each action ``(m,)``, or a number.
+    """
+    jacobian, size = wide(jacobian), wide(observation).abs()
+    small = without_effect(jacobian, size, reach) & (jacobian != 0).any(-2)
+    entries = small.reshape(-1, small.shape[-1]).all(0).nonzero().flatten().tolist()
+    if entries:
+        warnings.warn(
+            f"at the first step of {describe(dynamics)} the effect of the actions {entries} is "
+            "lost in rounding, and L1 leaves them alone: if states are small numbers, as positions "
+            "of micrometres in metres, give the model and L1 smaller units",
+            stacklevel=2,
+        )
+
+
+@torch.no_grad()
+def warn_of_shared_effects(dynamics: object, jacobian: Tensor, covariance: Tensor) -> None:
+    """Warn of actions that a controller which judges each by itself cannot tell apart.
+
+    Args:
+        dynamics: the model, to be named in the warning.
+        jacobian: ``(..., n, m)``.
+        covariance: of the residuals, ``(n, n)`` or ``(..., n, n)``.
+    """
+    columns = whitened(wide(covariance), wide(jacobian))[0].double()
+    columns = columns.reshape(-1, *columns.shape[-2:])
+    columns = columns[columns.isfinite().flatten(1).all(1)]
+    length = torch.linalg.vector_norm(columns, dim=-2)
+    columns = columns / length.clamp_min(torch.finfo(length.dtype).tiny).unsqueeze(-2)
+    values, vectors = torch.linalg.eigh(columns.mT @ columns)
+    # The share of each action in the combinations that have no effect.
+    share = (vectors.square() * (values < _PARALLEL).unsqueeze(-2)).sum(-1)
+    entries = ((share > 0.01) & (length > 0)).all(0).nonzero().flatten().tolist()
+    if entries and len(columns):
+        warnings.warn(
+            f"at the first step of {describe(dynamics)} the effects of the actions {entries} "
+            "cannot be told apart, and the robust controller acts on each only as far as it is "
+            "known by itself, perhaps never: make one action of actuators that do the same, or use "
+            "the paper's controller",
             stacklevel=2,
         )
 

@@ -31,14 +31,14 @@ def seal_width(observation_dim: int, action_dim: int, has_memory: bool) -> int:
 
 
 def sealed(observation: Tensor, state: L1State) -> Tensor:
-    """A copy of observation and state in the state's type, which the caller may modify in place.
+    """A copy of observation and state in one type, which the caller may modify in place.
 
     Wide entries that only some laws remember are represented by their sum.
     """
     # Every operation counts here: at a batch size of one each costs as much as a thousand
     # additions, and joining several types costs as much as three.
     x_hat, u_bar, q, sigma_m, n_switch, started, *_ = state
-    dtype = x_hat.dtype
+    dtype = q.dtype
     flags = n_switch.to(dtype), started.to(dtype)
     parts = [observation.to(dtype), x_hat, u_bar, q, sigma_m, *flags]
     if memory := state.memory():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TypeVar, cast
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -14,8 +14,6 @@ from torchrl_l1.control.kalman import Posterior
 from torchrl_l1.control.state import L1Diagnostics, L1State
 
 _HALF = (torch.float16, torch.bfloat16)
-
-Entries = TypeVar("Entries", L1State, L1Diagnostics)
 
 
 def saturate(config: L1Config, action: Tensor) -> Tensor:
@@ -88,12 +86,11 @@ def narrow(tensor: Tensor, dtype: torch.dtype) -> Tensor:
     return tensor.clamp(-largest, largest).to(dtype)
 
 
-def narrow_entries(entries: Entries, dtype: torch.dtype) -> Entries:
-    """:func:`narrow` of each entry of a state or of diagnostics."""
+def narrow_state(state: L1State, dtype: torch.dtype) -> L1State:
+    """:func:`narrow` of the entries that have the type of the model, see :func:`init`."""
     if dtype not in _HALF:
-        return entries
-    values = [None if value is None else narrow(value, dtype) for value in entries]
-    return type(entries)(*values)  # type: ignore[arg-type]
+        return state
+    return state._replace(x_hat=narrow(state.x_hat, dtype), u_bar=narrow(state.u_bar, dtype))
 
 
 def credible(config: L1Config, dtype: torch.dtype, x_err: Tensor, *states: Tensor) -> Tensor:
@@ -195,7 +192,9 @@ def diagnose(
         **_significance(posterior, prediction_error),
         forecast_skill=torch.ones_like(prediction_error) if skill is None else kalman.skill(skill),
     )
-    return narrow_entries(diagnostics, dtype)
+    if dtype not in _HALF:
+        return diagnostics
+    return L1Diagnostics(*(narrow(value, dtype) for value in diagnostics))
 
 
 def _share(flags: Tensor, dtype: torch.dtype) -> Tensor:

@@ -123,7 +123,9 @@ def init(
         observation_dim: n.
         action_dim: m.
         config: the settings, which decide what there is to remember; the paper's if ``None``.
-        dtype: type of all entries except ``n_switch`` and ``started``.
+        dtype: type of ``x_hat`` and ``u_bar``, which the model meets, and of all other numbers
+            unless it is of half precision: these are then float32, since what accumulates over
+            many steps, each of which changes it little, would stall.
         device: device of all entries.
 
     Examples:
@@ -131,23 +133,25 @@ def init(
         torch.Size([5, 4])
     """
 
-    def zeros(width: int, dtype: torch.dtype | None) -> Tensor:
+    def zeros(width: int, dtype: torch.dtype) -> Tensor:
         return torch.zeros(*batch_size, width, dtype=dtype, device=device)
 
+    dtype = torch.get_default_dtype() if dtype is None else dtype
+    precise = torch.promote_types(dtype, torch.float32)
     memory: dict[str, Tensor] = {}
     if config is not None and config.filter == "kalman":
-        memory["covariance"] = zeros(action_dim**2, dtype)
-        memory["noise"] = zeros(observation_dim, dtype)
-        memory["jacobian"] = zeros(observation_dim * action_dim, dtype)
+        memory["covariance"] = zeros(action_dim**2, precise)
+        memory["noise"] = zeros(observation_dim, precise)
+        memory["jacobian"] = zeros(observation_dim * action_dim, precise)
         if config.covariance != "residuals":
-            memory["residual_covariance"] = zeros(observation_dim**2, dtype)
+            memory["residual_covariance"] = zeros(observation_dim**2, precise)
         if config.skill_forgetting < 1:
-            memory["skill"] = zeros(2, dtype)
+            memory["skill"] = zeros(2, precise)
     return L1State(
         x_hat=zeros(observation_dim, dtype),
         u_bar=zeros(action_dim, dtype),
-        q=zeros(action_dim, dtype),
-        sigma_m=zeros(action_dim, dtype),
+        q=zeros(action_dim, precise),
+        sigma_m=zeros(action_dim, precise),
         n_switch=zeros(1, torch.int64),
         started=zeros(1, torch.bool),
         **memory,

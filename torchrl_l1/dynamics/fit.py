@@ -290,7 +290,8 @@ def fit_to_transitions(
         dynamics.set_elites(best_loss.topk(config.elites, largest=False).indices)
     residual = one_step_residuals(dynamics, validation)
     if bool(residual.isfinite().all()):  # otherwise the loss shows that the fit diverged
-        dynamics.residuals.measure(residual)
+        moved = validation["next", "observation"] - validation["observation"]
+        dynamics.residuals.measure(residual, moved)
     return replace(report, dropped=transitions.dropped)
 
 

@@ -48,8 +48,13 @@ class Residuals(nn.Module):
         self.register_buffer("calibrated", torch.tensor(False))
 
     @torch.no_grad()
-    def measure(self, residual: Tensor) -> None:
+    def measure(self, residual: Tensor, change: Tensor | None = None) -> None:
         """Measure the covariance of residuals ``(N, n)`` and store it.
+
+        Args:
+            residual: the model's errors.
+            change: the changes of state that were to be predicted ``(N, n)``, by which small
+                errors are told from small units, see :func:`shrunk_covariance`.
 
         Raises:
             ValueError: for residuals that are not finite, of the wrong width, or absent.
@@ -61,7 +66,7 @@ class Residuals(nn.Module):
             )
         if not residual.isfinite().all():
             raise ValueError("residuals have entries that are not finite: leave them out first")
-        self.covariance.copy_(shrunk_covariance(residual))
+        self.covariance.copy_(shrunk_covariance(residual, change))
         self.measured.fill_(True)
         # Any calibration was that of another model.
         self.inflation.fill_(_INFLATION)
@@ -78,12 +83,17 @@ class Residuals(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 
-def shrunk_covariance(residual: Tensor) -> Tensor:
+def shrunk_covariance(residual: Tensor, change: Tensor | None = None) -> Tensor:
     r"""Second moments of residuals ``(N, n)``, not centred, with shrunk correlations: ``(n, n)``.
 
     A constant error of the model is an error too. Correlations are shrunk towards zero with the
-    optimal intensity (Schäfer and Strimmer, 2005); states without errors get a variance of a
-    millionth of the median one. The result is positive definite.
+    optimal intensity (Schäfer and Strimmer, 2005). No variance is below a millionth of the mean
+    square of the state's change or, where that is zero or not given, of the median variance, which
+    may be in other units. The result is positive definite.
+
+    Args:
+        residual: the model's errors.
+        change: the changes of state that were to be predicted ``(N, n)``.
 
     Examples:
         >>> shrunk_covariance(torch.tensor([[1.0, 0.0], [-1.0, 0.0]]))
@@ -94,7 +104,11 @@ def shrunk_covariance(residual: Tensor) -> Tensor:
     rows = residual.to(torch.float64)
     count, n = rows.shape
     variance = rows.square().mean(0)
-    least = 1e-6 * variance[variance > 0].median() if bool((variance > 0).any()) else 1e-12
+    some = variance[variance > 0]
+    least = 1e-6 * some.median() if some.numel() else variance.new_tensor(1e-12)
+    if change is not None:
+        moved = change.to(torch.float64).square().mean(0)
+        least = torch.where(moved > 0, 1e-6 * moved, least)
     deviation = variance.clamp_min(least).sqrt()
     scaled = rows / deviation
     correlation = scaled.T @ scaled / count
@@ -165,7 +179,8 @@ def calibrate_filter(
         return None
     residual, jacobian, action = residual[whole], jacobian[whole], action[whole]
     if not residuals.measured:
-        residuals.measure(residual.flatten(0, 1))
+        moved = (following - observation)[whole]
+        residuals.measure(residual.flatten(0, 1), moved.flatten(0, 1))
     covariance = residuals.covariance
     if config.covariance != "residuals" and residual_covariance is not None:
         covariance = residual_covariance(observation[whole], action, config.covariance)

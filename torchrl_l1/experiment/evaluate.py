@@ -155,7 +155,8 @@ def _measure_residuals(algorithm: Algorithm, buffer: dict[str, Any]) -> None:
     held_out = data[data["validation"].reshape(-1)]
     if not bool(dynamics.residuals.measured) and held_out.shape[0]:
         held_out = held_out.set("action", held_out[action_key])
-        dynamics.residuals.measure(one_step_residuals(dynamics, held_out))
+        moved = held_out["next", "observation"] - held_out["observation"]
+        dynamics.residuals.measure(one_step_residuals(dynamics, held_out), moved)
     if bool(dynamics.residuals.calibrated):
         return
     config = L1Config.robust(task.dt, action_low=task.action_low, action_high=task.action_high)
