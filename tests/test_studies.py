@@ -103,37 +103,9 @@ def section(page: str, heading: str) -> str:
 def test_readme_shows_what_is_recovered() -> None:
     text = (ROOT / "README.md").read_text()
     shown = rows(text[text.index("| share of the oracle's gain |") :].partition("\n\n")[0])
+    assert shown == rows((RESULTS / "questions/recovered.md").read_text())
     for line, l1 in zip(shown, ("paper", "robust"), strict=True):
-        numbers = list(line.values())[1:]
-        expected = [overall()[task][f"{l1} recovered"].partition(" [")[0] for task in TASKS]
-        assert numbers == expected
-
-
-def test_first_sentences_of_the_study_quote_the_table() -> None:
-    first = section("docs/studies/robustness.md", "# What L1 recovers").partition("\n## ")[0]
-    shares = {
-        task: float(row["robust recovered"].split()[0])
-        for task, row in overall().items()
-        if "[" in row["robust recovered"]
-    }
-    quoted = re.search(r"between ([\d.]+) \((\w+)\)\s+and ([\d.]+) \((\w+)\)", first)
-    assert quoted is not None
-    of = {task.replace("_", ""): share for task, share in shares.items()}
-    for words, extreme in (((quoted[1], quoted[2]), min), ((quoted[3], quoted[4]), max)):
-        assert float(words[0]) == of[words[1].lower()] == extreme(of.values())
-    harm = rows((RESULTS / "robust/harm.md").read_text())
-    worst = min(float(row["L1 robust, %"].split()[0]) for row in harm)
-    for text in (first, section("docs/studies/index.md", "## What should I switch on")):
-        assert f"at worst {-worst:.1f} % lower" in " ".join(text.split())
-    costs = {
-        (row["task"], row["noise"]): f"{-float(row['L1 paper, %'].split()[0]):.0f}" for row in harm
-    }
-    help_page = (ROOT / "docs/l1.md").read_text()
-    for words, noise, tasks in (
-        ("{}, {} and {} % (Hopper's", "action", ("half_cheetah", "walker", "hopper")),
-        ("{}, {} and {} % of their return", "observation", ("hopper", "walker", "half_cheetah")),
-    ):
-        assert words.format(*(costs[task, noise] for task in tasks)) in help_page
+        assert list(line.values())[1:] == [overall()[task][f"{l1} recovers"] for task in TASKS]
 
 
 @pytest.mark.parametrize("algorithm", ["METRPO", "MBMF"])
@@ -344,6 +316,7 @@ DISTURBANCES = {
     "motor gain": "weak motor",
     "stiction": "stiction",
     "payload": "payloads",
+    "joint armature": "other armatures",
 }
 
 
@@ -358,7 +331,7 @@ def test_suite_page_names_whatever_the_robust_controller_makes_worse() -> None:
                 of_task = first.partition(task)[2]
                 assert DISTURBANCES[row["disturbance"]] in of_task, (task, row["disturbance"])
                 worse.add(DISTURBANCES[row["disturbance"]])
-    advice = section("docs/studies/index.md", "## What should I switch on").partition("`dead")[0]
+    advice = section("docs/studies/index.md", "it is seen to cost return").partition("`dead")[0]
     for words in DISTURBANCES.values():
         assert words in worse or words not in first + " ".join(advice.split()), words
 
@@ -380,22 +353,45 @@ def test_suite_page_quotes_its_tables() -> None:
     assert [pair for pair in quoted if not in_a_table(*pair)] == []
 
 
-def test_suite_page_quotes_what_the_record_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_suite_page_counts_verdicts() -> None:
+    text = " ".join(section("docs/studies/suite.md", "**In short.**").split())
+    count = {
+        row["disturbance"].split("*")[1].rstrip("\\"): [
+            sum(int(cell.split(" / ")[arm]) for cell in list(row.values())[2:]) for arm in (0, 1)
+        ]
+        for row in rows((RESULTS / "suite/verdicts.md").read_text())
+        if row["disturbance"].startswith("number")
+    }
+    assert count["worse"][1] == 3 and "in three of 99 cells" in text
+    assert f"In {count['not touched'][1]} cells a change of more than a tenth is excluded" in text
+    assert f"in {count['cannot tell'][1]} eight episodes cannot tell" in text
+    assert f"costs return in {count['worse'][0]} cells" in text
+    assert sum(of[1] for of in count.values()) == 99
+
+
+def test_suite_page_quotes_what_telling_changes_from_noise_changed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     suite = script("suite", monkeypatch)
-    text = section("docs/studies/suite.md", "## What the record").partition("## Why")[0]
-    delays = text.partition("Under actuator delays")[2].partition("Undisturbed")[0]
+    told = " ".join(section("docs/studies/suite.md", "Ten cells were worse before").split())
 
     def mean(task: str, l1: str, disturbance: str) -> str:
-        cells = suite.groups_of(suite.read(task)).get(disturbance, [suite.NONE])
-        return f"{suite.sample(suite.read(task), l1, cells).mean():.0f}"
+        of = suite.read(task)
+        return f"{suite.sample(of, l1, suite.groups_of(of)[disturbance]).mean():.0f}"
 
-    for task in TASKS[1:]:
+    for task, disturbance, last in (
+        ("swimmer", "delay", "off"), ("hopper", "delay", "off"), ("half_cheetah", "step", "oracle"),
+    ):  # fmt: skip
         name = task.title().replace("_", "")
-        told = re.search(rf"{name} (?:returns )?(\S+) .*?and (\S+)[^(]*\((\S+?)[ )]", delays)
-        every = tuple(mean(task, l1, "delay") for l1 in ("whole", "robust", "off"))
-        assert told is not None and told.groups() == every, task
-    told = [mean("half_cheetah", l1, "none") for l1 in ("whole", "robust", "off")]
-    assert "HalfCheetah returns {} and {} ({})".format(*told) in text
+        found = re.search(
+            rf"{name} (?:returned )?(\S+) and (?:returns )?(\S+) \([^-\d]*(-?\d+)", told
+        )
+        assert found is not None, task
+        assert found.groups() == tuple(
+            mean(task, l1, disturbance) for l1 in ("earlier", "robust", last)
+        )
+    worse = rows((RESULTS / "suite/changed.md").read_text())[-2]
+    assert sum(int(cell.split(" / ")[0]) for cell in list(worse.values())[1:]) == 10
 
 
 def test_theorem_page_quotes_the_residuals_of_the_tasks() -> None:

@@ -10,12 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import binom, t
+from scipy.stats import binom, t, ttest_1samp
+
+from tests.test_studies import script
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs/results"
 TASKS = ("inverted_pendulum", "swimmer", "hopper", "walker", "half_cheetah")
-SPELLED = {task.replace("_", ""): task for task in TASKS}
+NAMES = {
+    "the pendulum": "inverted_pendulum",
+    **{task.title().replace("_", ""): task for task in TASKS[1:]},
+}
 UNDISTURBED = (0.0, 0.0)
 Row = dict[str, str]
 Cell = tuple[str, ...]
@@ -60,6 +65,18 @@ def differences(editions: Iterable[str], l1: str, policy: str) -> dict[Cell, np.
             cell, new = (row["task"], row["noise"]), values(row["differences"])
             if len(new) >= len(found.get(cell, ())):
                 found[cell] = new
+    if l1 == "robust":  # its runs are of the machine on which some without L1 were trained first
+        column = {"stochastic": "return", "deterministic": "return_deterministic"}[policy]
+        returns = {
+            (row["task"], row["noise"], row["l1"], row["seed"]): float(row[column])
+            for row in read("table1/runs.csv") + read("trained_twice.csv")
+            if row["return"]
+        }
+        for cell, of in found.items():
+            seeds = map(str, range(len(of)))
+            found[cell] = np.array(
+                [returns[*cell, l1, seed] - returns[*cell, "off", seed] for seed in seeds]
+            )
     return found
 
 
@@ -132,25 +149,6 @@ def test_half_cheetahs_pairs_of_the_second_edition_are_quoted() -> None:
     assert f"and {off:.0f} and {on:.0f} in the second with three" in page("studies/index")
 
 
-def test_what_two_machines_make_of_walker_is_quoted() -> None:
-    def mean_action(rows: list[Row], l1: str) -> float:
-        [found] = [
-            float(row["return_deterministic"])
-            for row in rows
-            if (row["task"], row["noise"], row["l1"], row["seed"]) == ("walker", "none", l1, "0")
-        ]
-        return found
-
-    robust, paired = (mean_action(read("table1/runs.csv"), l1) for l1 in ("robust", "off"))
-    own = mean_action(read("trained_twice.csv"), "off")
-    words = (
-        f"returns {robust:.0f} with the robust controller, {robust / paired:.1f} times the "
-        f"{paired:.0f} of the run that it is paired with, but {robust / own:.1f} times the "
-        f"{own:.0f} of its own"
-    )
-    assert words in page("studies/table1")
-
-
 def biased(task: str) -> Returns:
     """Mean returns of the frozen policies, by policy, controller, noise and bias."""
     found: dict[tuple[str, str, str, Bias], list[float]] = {}
@@ -171,90 +169,103 @@ def every_bias(returns: Returns) -> list[Bias]:
     return [bias for bias in dict.fromkeys(key[3] for key in returns) if bias != UNDISTURBED]
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_what_controllers_make_of_all_six_biases_is_quoted(task: str) -> None:
-    returns, text = biased(task), page("studies/index")
-    six = every_bias(returns)
-    assert len(six) == 6
-    means = {
-        l1: np.mean(list(over(returns, l1, six).values()))
-        for l1 in ("off", "paper", "robust", "oracle")
-    }
-    if task != "walker":
-        assert means["robust"] > means["off"], "the page says that it gains on the other four"
-        return
-    words = (
-        "{off:.0f} without a controller, {robust:.0f} with the robust one, {oracle:.0f} with the "
-    )
-    assert words.format(**means) + f"oracle and {means['paper']:.0f} with the paper's" in text
-    off, on = (sum(over(returns, l1, [(-0.2, 0.0)]).values()) for l1 in ("off", "robust"))
-    assert f"at a bias of -0.2 the robust controller costs them {1 - on / off:.0%}" in text.replace(
-        " %", "%"
-    )
-
-
-def test_extreme_shares_of_the_oracles_gain_are_quoted() -> None:
+def test_what_controllers_make_of_all_six_biases_is_quoted() -> None:
     text = page("studies/index")
-    for l1, words in (("robust", "(#how-to-read-them)) gets"), ("paper", "gain, the paper's")):
-        shares = {
-            row["task"]: float(row[f"{l1} recovered"].split()[0])
-            for row in written("robust/overall.md")
-        }
-        found = re.search(rf"{re.escape(words)} between (\S+) \((\w+)\) and (\S+) \((\w+)\)", text)
-        assert found is not None
-        for number, name, extreme in ((found[1], found[2], min), (found[3], found[4], max)):
-            assert float(number) == shares[SPELLED[name.lower()]] == extreme(shares.values())
+    for task in TASKS:
+        returns = biased(task)
+        six = every_bias(returns)
+        assert len(six) == 6
+        off, on = (np.mean(list(over(returns, l1, six).values())) for l1 in ("off", "robust"))
+        assert on > off, "the page says that it returns more on all five tasks"
+        if task == "walker":
+            assert f"Walker's {on:.0f} for {off:.0f}." in text
+    returns, suits = biased("hopper"), (-0.4, 0.0)
+    undisturbed = returns["seed_0", "off", "none", UNDISTURBED]
+    off, robust, oracle = (
+        returns["seed_0", l1, "none", suits] for l1 in ("off", "robust", "oracle")
+    )
+    words = f"returns {undisturbed:.0f} undisturbed and {off:.0f} at a bias of -0.4"
+    for one in (text, page("studies/robustness")):
+        assert words in one
+        assert f"makes {robust:.0f} of that" in one and f"the oracle {oracle:.0f}" in one
 
 
-def test_shares_of_half_cheetahs_policies_are_quoted() -> None:
-    returns, text = biased("half_cheetah"), page("studies/index")
-    # All biases but one, at which the oracle's gain is not told from chance.
-    costly = [bias for bias in every_bias(returns) if bias != (0.2, 0.0)]
-    of = {l1: over(returns, l1, costly) for l1 in ("off", "paper", "robust", "oracle")}
-
-    def share(l1: str, runs: Iterable[str]) -> str:
-        gain, gap = (sum(of[one][run] - of["off"][run] for run in runs) for one in (l1, "oracle"))
-        return f"{gain / gap:.2f}"
-
-    runs = list(of["off"])
-    first, second, third, last = (share("paper", [run]) for run in runs)
-    assert f"the paper's are {first}, {second}, {third} and {last}." in text
-    robust, paper = (share(l1, runs[2:]) for l1 in ("robust", "paper"))
-    assert f"give {robust} with the robust controller and {paper} with the paper's" in text
+def single_policies() -> list[dict[str, str]]:
+    """What each policy loses and gets back, as the script wrote it."""
+    return written("robust/policies.md")
 
 
-def test_shares_of_two_other_policies_of_hopper_are_quoted() -> None:
-    found: dict[str, list[str]] = {"paper": [], "robust": []}
-    for row in read("table1/disturbances.csv"):
-        place = (row["task"], row["gain"], row["training_seeds"])
-        if place == ("hopper", "1.0", "2") and float(row["bias"]) > 0 and row["l1"] in found:
-            found[row["l1"]].append(f"{float(row['recovered']):.2f}")
-    words = "recovers {} and {} under the two biases that count there, the robust one {} and {}."
-    assert words.format(*found["paper"], *found["robust"]) in page("studies/index")
+def test_shares_of_single_policies_are_quoted() -> None:
+    first = page("studies/robustness").partition(" ## ")[0]
+    index = page("studies/index").partition("## What does L1 recover")[2].partition("![")[0]
+
+    def between(l1: str) -> str:
+        """The lowest share and the highest, with their policies."""
+        of = [(float(row[f"{l1} recovers"].split()[0]), row) for row in single_policies()]
+        ends = [pick(of, key=lambda entry: entry[0]) for pick in (min, max)]
+        names = {task: name for name, task in NAMES.items()}
+        words = [f"{share:.2f} ({names[row['task']]}, {row['policy']})" for share, row in ends]
+        return f"between {words[0]} and {words[1]}"
+
+    assert between("robust") in first and between("robust") in index
+    assert f"the paper's {between('paper')}" in index
+    held_out = [
+        float(row["robust recovers"].split()[0])
+        for row in single_policies()
+        if not (row["policy"] == "seed 0" and row["task"] in ("swimmer", "hopper", "walker"))
+    ]
+    assert f"its shares are {min(held_out):.2f} to {max(held_out):.2f} on the other" in page(
+        "studies/index"
+    )
+    paper = {
+        task: [row["paper recovers"].split()[0] for row in single_policies() if row["task"] == task]
+        for task in TASKS
+    }
+    walker, cheetah = paper["walker"], paper["half_cheetah"]
+    hopper = sorted(paper["hopper"], key=float)
+    told = f"gets back {hopper[0]} to {hopper[-1]} on Hopper, {walker[0]} and {walker[1]} on Walker"
+    words = f"{told}, and {cheetah[0]}, {cheetah[1]} and {cheetah[2]} on HalfCheetah"
+    assert words in first
 
 
-def test_what_robust_costs_where_nothing_is_wrong_is_quoted() -> None:
-    changes: list[tuple[float, bool]] = []
+def test_what_controllers_cost_where_there_is_nothing_to_cancel_is_quoted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    robust = script("robust", monkeypatch)
+    lower: dict[str, list[tuple[str, str, str, float]]] = {"paper": [], "robust": []}
+    pairs = 0
     for task in TASKS:
         more = RESULTS / f"robust/undisturbed_{task}.csv"
-        returns = biased(f"undisturbed_{task}" if more.exists() else task)
-        for run, noise in product({run for run, *_ in returns}, ("none", "action", "observation")):
-            off, on = (returns[run, l1, noise, UNDISTURBED] for l1 in ("off", "robust"))
-            learned = task == "inverted_pendulum" or off > 1
-            if (task, run) != (
-                "swimmer",
-                "seed_2",
-            ):  # swims nowhere: a change is a share of nothing
-                changes.append(((on - off) / abs(off), learned))
-    worst = -100 * min(change for change, _ in changes)
-    of_learned = -100 * min(change for change, learned in changes if learned)
-    cells = [row["L1 robust, %"].split(maxsplit=1) for row in written("robust/harm.md")]
-    mean, ends = min(cells, key=lambda cell: float(cell[0]))
-    words = (
-        f"at worst {-float(mean):.1f} % lower {ends}, and that of single policies up to "
-        f"{worst:.1f} % ({of_learned:.1f} % of those that have learned their task)"
-    )
-    assert words in page("studies/index")
+        episodes = robust.read(more if more.exists() else RESULTS / f"robust/{task}.csv")
+        for run in sorted({row["run"] for row in episodes}):
+            for noise in ("none", "action", "observation"):
+                pairs += 1
+                off = robust.returns(episodes, run, "off", [robust.NONE], noise)
+                for l1, found in lower.items():
+                    on = robust.returns(episodes, run, l1, [robust.NONE], noise)
+                    change = (on - off) / abs(off.mean()) * 100
+                    high = ttest_1samp(change, 0.0).confidence_interval().high
+                    if high < 0:
+                        found.append((task, run, noise, float(change.mean())))
+    one, two, three = lower["robust"]
+    assert one[:3] == ("swimmer", "seed_2", "action") and f"{-one[3]:.1f}" == "0.2"
+    assert two[:3] == ("hopper", "seed_1", "none") and f"{-two[3]:.1f}" == "19.6"
+    assert three[:3] == ("hopper", "seed_2", "action") and 4.5 < -three[3] < 5.5
+    first = " ".join((ROOT / "docs/studies/robustness.md").read_text().split())
+    assert f"in three of the {pairs} pairs of a policy and a noise" in first
+    assert f"The paper's lowers it in {len(lower['paper'])} of them" in first
+    harm = written("robust/harm.md")
+    worst = next(row for row in harm if (row["task"], row["noise"]) == ("hopper", "none"))
+    low, high = re.findall(r"-([\d.]+)[,\]]", worst["robust, worst policy, %"])
+    index = " ".join((ROOT / "docs/studies/index.md").read_text().split())
+    assert f"costs one of Hopper's 19.6 % of its return [{high}, {low}]" in index
+    costs = {(row["task"], row["noise"]): f"{-float(row['paper, mean, %']):.0f}" for row in harm}
+    help_page = (ROOT / "docs/l1.md").read_text()
+    for words, noise, tasks in (
+        ("{}, {} and {} % (mean", "action", ("half_cheetah", "walker", "hopper")),
+        ("{}, {} and {} % of their return", "observation", ("hopper", "walker", "half_cheetah")),
+    ):
+        assert words.format(*(costs[task, noise] for task in tasks)) in help_page
 
 
 def test_what_a_dead_zone_of_one_costs_is_quoted() -> None:
@@ -286,56 +297,6 @@ def test_what_seeds_of_offline_learning_differ_in_is_quoted() -> None:
         off, on = (found[task, quality, seed, one] for one in ("off", l1))
         return float(np.mean([on[bias] - off[bias] for bias in off if bias]))
 
-    def cost(quality: str, seed: str) -> str:
-        off, on = (found["hopper", quality, seed, one][0.0] for one in ("off", "robust"))
-        return f"{100 * (1 - on / off):.0f}"
-
     text = page("studies/offline")
-    one, other = (
-        gain("hopper", "medium", seed, "robust") / gain("hopper", "medium", seed, "oracle")
-        for seed in "01"
-    )
-    assert f"share is {one:.2f} on one and {other:.2f} on the other" in text
-    medium, expert = ([cost(quality, seed) for seed in "01"] for quality in ("medium", "expert"))
-    words = "{} and {} % on the two seeds with medium data, {} and {} % with expert data"
-    assert words.format(*medium, *expert) in text
     lost, gained = (gain("half_cheetah", "random", seed, "oracle") for seed in "01")
     assert f"by {-lost:.0f} on one seed; on the other it gains {gained:.0f}" in text
-
-
-def test_what_the_record_changes_under_a_step_is_quoted() -> None:
-    of: dict[str, dict[float, np.ndarray]] = {}
-    for row in read("suite/half_cheetah.csv"):
-        if row["disturbance"] == "step":
-            of.setdefault(row["l1"], {})[float(row["value"])] = values(row["returns"])
-    means = {l1: np.mean(list(cells.values()), axis=0) for l1, cells in of.items()}
-    gap = np.mean(means["oracle"] - means["off"])
-    without, with_it = (np.mean(means[l1] - means["off"]) / gap for l1 in ("whole", "robust"))
-    change = means["robust"] - means["whole"]
-    words = (
-        f"got back {without:.2f} of the oracle's gain without the record, and gets {with_it:.2f} "
-        f"with it (difference of the returns {change.mean():.0f} [{{:.0f}}, {{:.0f}}])"
-    )
-    assert words.format(*interval(change)) in page("studies/index")
-
-
-def test_other_policies_that_lose_with_the_record_are_told() -> None:
-    returns = {
-        (row["policy"], row["disturbance"], row["l1"]): values(row["returns"])
-        for row in read("record.csv")
-    }
-    lose = set()
-    for policy, words, l1 in returns:
-        if l1 == "robust":
-            change = returns[policy, words, l1] - returns[policy, words, "off"]
-            if interval(change)[1] < 0:
-                lose.add((policy, words))
-    assert lose == {
-        ("half_cheetah seed 1", "dead zone 0.2"),
-        ("half_cheetah seed 2", "dead zone 0.2"),
-        ("half_cheetah seed 2", "sensors two steps late"),
-    }
-    words = (
-        "both of HalfCheetah lose under a dead zone, and one of them with sensors two steps late"
-    )
-    assert words in page("studies/index")
