@@ -14,6 +14,7 @@ from __future__ import annotations
 import csv
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -100,23 +101,20 @@ def policy_rows(episodes: Sequence[Row]) -> list[Row]:
     """
     rows = []
     for run in sorted({row["run"] for row in episodes}):
-        every = {(row["bias"], row["signs"]) for row in episodes if row["run"] == run} - {NONE}
-
-        def of(
-            l1: str, disturbances: Sequence[Disturbance], noise: str = "none", run: str = run
-        ) -> np.ndarray:
-            return returns(episodes, run, l1, disturbances, noise)
-
+        mine = [row for row in episodes if row["run"] == run]
+        every = sorted({(row["bias"], row["signs"]) for row in mine} - {NONE})
+        of = partial(returns, mine, run, noise="none")
         undisturbed = of("off", [NONE])
         least = LEAST * abs(undisturbed.mean())
         costly = []
-        for one in sorted(every):
+        for one in every:
             gap = of("oracle", [one]) - of("off", [one])
             if gap.mean() > least and student_interval(gap.tolist()).low > 0:
                 costly.append(one)
-        row: Row = {"run": run, "undisturbed": undisturbed.mean(), "costly": costly}
+        row: Row = {"run": run, "undisturbed": undisturbed.mean(), "tested": len(every)}
+        row["costly"] = costly
         for l1 in CONTROLLERS:
-            row[f"all {l1}"] = of(l1, sorted(every)).mean()
+            row[f"all {l1}"] = of(l1, every).mean()
             row[l1] = of(l1, costly).mean() if costly else None
         for l1 in ("paper", "robust") if costly else ():
             off = of("off", costly)
@@ -131,7 +129,7 @@ def policy_lines(task: str, rows: Sequence[Row]) -> list[Row]:
     for row in rows:
         line = {"task": task, "policy": row["run"].replace("_", " ")}
         line |= {"undisturbed": number(row["undisturbed"])}
-        line["costly biases"] = f"{len(row['costly'])} of 6"
+        line["costly biases"] = f"{len(row['costly'])} of {row['tested']}"
         for l1 in CONTROLLERS:
             line[l1] = "–" if row[l1] is None else number(row[l1])
         for l1 in ("paper", "robust"):

@@ -369,8 +369,9 @@ def _prepared(step: StepFunction, config: L1Config, model: ActionJacobian) -> St
             action = saturate(config, u_rl)
             is_known = model.ready
             model.prepare(observation, action)
-            if not is_known:
+            if not is_known or config.needs_calibration:
                 _, jacobian = model.value_and_jacobian(observation, action)
+            if not is_known:
                 reach = like(jacobian, config.half_range)
                 warn_of_small_effects(model.dynamics, jacobian, observation, reach)
             if config.needs_covariance:
@@ -385,7 +386,6 @@ def _prepared(step: StepFunction, config: L1Config, model: ActionJacobian) -> St
                 is_calibrated = not config.needs_calibration or config.inflation is not None
                 warn_of_residuals(model.dynamics, is_calibrated=is_calibrated)
             if config.needs_calibration:
-                _, jacobian = model.value_and_jacobian(observation, action)
                 known = model.residual_statistics(observation, action, config.covariance)
                 warn_of_shared_effects(model.dynamics, jacobian, known.covariance)
             is_checked = True
